@@ -1,0 +1,245 @@
+"""Q-learning on a fuzzy network (section 4 of the paper, equations 9-15).
+
+Each rule concludes a linear function of the state and the action, and the network weighs them:
+
+    f_k(x, a) = c_x^k . x + c_a^k . a + c_k                                (eq. 9)
+    Q(x, a)   = sum_k S_k f_k(x, a)                                        (eq. 10)
+    P(j | x)  = exp(Q(x, a_j) / T) / sum_i exp(Q(x, a_i) / T)              (eq. 11)
+    dQ        = r + gamma max_j Q(x', a_j) - Q(x, a)                       (eqs 12, 13)
+    W <- W + epsilon dQ E,   E <- dQ(x, a)/dW + gamma lambda E             (eqs 14, 15; lambda = 0)
+
+The range [-1, 1] of the scalar action is cut into J equal segments; one is drawn by roulette
+(eq. 11) and the action uniformly inside it. The gradient comes from autograd for antecedents and
+consequents; as usual the target is held constant (semi-gradient).
+"""
+
+import math
+from itertools import accumulate, pairwise
+from typing import Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sofnn_torch.sofnn import SOFNN
+
+Coding = Literal["scalar", "wheels", "onehot", "antecedent"]
+TURN = 0.4  # wheel speed of a turn over that of going straight: 4 mm/s of 10 mm/s
+
+
+def code_length(coding: Coding, segments: int) -> int:
+    """Length of the action vector in equation 9."""
+    return {"scalar": 1, "wheels": 2, "onehot": segments, "antecedent": 1}[coding]
+
+
+class QLearning:
+    """The learner of section 4. Rows of the consequents: c_x (n), c_a, c (1).
+
+    Args:
+        net: network over the state, or over state and action with the coding ``antecedent``.
+        n_states: length n of the state.
+        actions: what the robot takes. ``three``: the segment's number (J = 3: right turn,
+            straight, left turn). ``steer``: the continuous action.
+        coding: the action vector of equation 9. ``scalar``: the number itself; ``wheels``: the
+            (left, right) wheel speeds it stands for over the fastest; ``onehot``: the indicator
+            of its segment; ``antecedent``: the scalar, which also enters the antecedents
+            (the paper's fuzzy net - a).
+        segments: number J of segments.
+        temperature: T of equation 11.
+        gamma: discount per decision.
+        trace_decay: lambda; the paper has 0.
+        trace_cut: clear the traces when the chosen segment is not the greedy one (Watkins).
+        trace_limit: bound of the consequents' traces, None for no bound.
+        rate_state: learning rate of c_x.
+        rate_action: learning rate of c_a.
+        rate_constant: learning rate of c.
+        rate_centre: learning rate of the centres.
+        rate_width: learning rate of the widths.
+        seed: seed of the roulette and of the action inside a segment.
+
+    Raises:
+        ValueError: the network has another number of inputs or outputs, or a setting is out of
+            range.
+    """
+
+    def __init__(
+        self,
+        net: SOFNN,
+        n_states: int,
+        *,
+        actions: Literal["three", "steer"] = "three",
+        coding: Coding = "onehot",
+        segments: int = 3,
+        temperature: float = 0.05,
+        gamma: float = 0.99,
+        trace_decay: float = 0.8,
+        trace_cut: bool = True,
+        trace_limit: float | None = 1.0,
+        rate_state: float = 0.0,
+        rate_action: float = 1.0,
+        rate_constant: float = 0.0,
+        rate_centre: float = 0.0,
+        rate_width: float = 0.0,
+        seed: int = 0,
+    ):
+        length = code_length(coding, segments)
+        inputs = n_states + (coding == "antecedent")
+        if (net.n_inputs, net.n_outputs) != (inputs, n_states + length + 1):
+            raise ValueError(
+                f"coding {coding} needs {inputs} inputs and {n_states + length + 1} outputs, "
+                f"the network has {net.n_inputs} and {net.n_outputs}"
+            )
+        if actions == "three" and segments != 3:
+            raise ValueError(f"the three actions need 3 segments, got {segments}")
+        if not temperature > 0:
+            raise ValueError(f"the temperature must be positive, got {temperature}")
+        self.net, self.n, self.actions, self.coding = net, n_states, actions, coding
+        self.segments, self.temperature, self.gamma = segments, temperature, gamma
+        self.decay, self.trace_cut, self.trace_limit = gamma * trace_decay, trace_cut, trace_limit
+        self.rng = np.random.default_rng(seed)
+        self.antecedents = rate_centre > 0 or rate_width > 0
+        rates = [rate_state] * n_states + [rate_action] * length + [rate_constant]
+        if self.antecedents:
+            rates = [rate_centre] * net.n_inputs + [rate_width] * net.n_inputs + rates
+        self.rates = net.default_width.new_tensor(rates)[:, None]
+        ends = [-1 + 2 * j / segments for j in range(segments + 1)]
+        self.edges = list(pairwise(ends))
+        middles = [(low + high) / 2 for low, high in self.edges]
+        # The three actions are the ends and the middle of the steering range themselves.
+        self.representatives = [-1.0, 0.0, 1.0] if actions == "three" else middles
+        codes = [self._code(j, a) for j, a in enumerate(self.representatives)]
+        self.codes = self.rates.new_tensor(codes)  # (J, length)
+        self.value = 0.0
+        self._log = {"value": [], "error": [], "greedy": [], "firing": []}
+
+    def start(self, observation: np.ndarray) -> int | np.ndarray:
+        """Begin a trial at the observation (n,): clear the traces, choose the first action."""
+        self.net.traces.zero_()
+        x = self._tensor(observation)
+        return self._choose(x, self._firing(x))
+
+    def step(
+        self, reward: float, observation: np.ndarray, terminated: bool
+    ) -> int | np.ndarray | None:
+        """Learn from the reward of the last action, then choose the next (None at the end)."""
+        x = self._tensor(observation)
+        if terminated:
+            self._learn(reward - self.value)
+            return None
+        firing = self._firing(x)
+        following = self.action_values(x, firing).max().item()
+        self._learn(reward + self.gamma * following - self.value)
+        return self._choose(x, self._firing(x) if self.antecedents else firing)
+
+    def act(self, observation: np.ndarray, explore: bool = False) -> int | np.ndarray:
+        """The greedy action, or one by roulette; learns nothing and adds no rule."""
+        x = self._tensor(observation)
+        with torch.no_grad():
+            values = self.action_values(x, self.net.normalised_firing(self._inputs(x)))
+        segment = self._roulette(values.tolist()) if explore else int(values.argmax())
+        return segment if self.actions == "three" else self._command(self.representatives[segment])
+
+    def statistics(self) -> dict[str, float]:
+        """Means over the decisions since the last call (docs/metrics.md); starts afresh."""
+        log, self._log = self._log, {name: [] for name in self._log}
+        if not log["value"]:
+            return {}
+        value, error = torch.tensor(log["value"]), torch.tensor(log["error"] or [0.0])
+        return {
+            "policy/value_mean": value.mean().item(),
+            "policy/value_max": value.max().item(),
+            "policy/greedy_share": sum(log["greedy"]) / len(log["greedy"]),
+            "learning/error_rms": error.square().mean().sqrt().item(),
+        } | self.net.statistics(log["firing"])
+
+    def state_dict(self) -> dict:
+        """Everything that the future depends on, as tensors, numbers and text."""
+        rng = self.rng.bit_generator.state
+        return {"net": self.net.state_dict(), "rng": rng, "value": self.value}
+
+    def load_state_dict(self, state: dict) -> None:
+        """Counterpart of `state_dict`; a fresh learner takes the size of the stored network."""
+        self.net.load_state_dict(state["net"])
+        self.rng.bit_generator.state = state["rng"]
+        self.value = state["value"]
+
+    @torch.no_grad()
+    def action_values(self, x: Tensor, firing: Tensor) -> Tensor:
+        """Q(x, a_j) of every segment (eq. 10) from the firing (1, K) or (J, K). Shape: (J,)."""
+        conclusions = firing @ self.net.learnable(False).T  # (1 or J, m)
+        constant = x.new_ones(self.segments, 1)
+        features = torch.cat([x.expand(self.segments, -1), self.codes, constant], 1)  # (J, m)
+        return (features * conclusions).sum(1)
+
+    def _firing(self, x: Tensor) -> Tensor:
+        """Normalised firing at x: (1, K), or (J, K) if the action is an antecedent."""
+        if self.coding != "antecedent":
+            return self.net.observe(x)
+        inputs = self._inputs(x)
+        if self.net.n_rules == 0:
+            self.net.grow(inputs[self.segments // 2])
+        with torch.no_grad():
+            return self.net.normalised_firing(inputs)
+
+    def _choose(self, x: Tensor, firing: Tensor) -> int | np.ndarray:
+        """Draw an action (eq. 11) and add the gradient of its value to the traces."""
+        net = self.net
+        values = self.action_values(x, firing).tolist()
+        segment = self._roulette(values)
+        low, high = self.edges[segment]
+        inside = self.rng.uniform(low, high)
+        scalar = self.representatives[segment] if self.actions == "three" else inside
+        # The paper draws the action inside the segment also where the robot only has three.
+        code = x.new_tensor(self._code(segment, inside if self.coding == "scalar" else scalar))
+        state = x
+        if self.coding == "antecedent":
+            state = torch.cat([x, code])
+            firing = net.observe(state)
+        parameters = net.learnable(self.antecedents)
+        if self.antecedents:
+            firing = net.normalised_firing(state[None], parameters)
+        conclusions = parameters[-net.n_outputs :] @ firing[0]
+        value = torch.cat([x, code, x.new_ones(1)]) @ conclusions
+        self.value = value.item()
+        greedy = values[segment] == max(values)
+        decay = self.decay if greedy or not self.trace_cut else 0.0
+        net.accumulate(torch.autograd.grad(value, parameters)[0], decay)
+        if self.trace_limit is not None:
+            net.traces[-net.n_outputs :].clamp_(-self.trace_limit, self.trace_limit)
+        self._log["value"].append(self.value)
+        self._log["greedy"].append(greedy)
+        self._log["firing"].append(net.max_firing)
+        return segment if self.actions == "three" else self._command(scalar)
+
+    def _learn(self, error: float) -> None:
+        """Equations 14 and 15 for the temporal-difference error."""
+        self._log["error"].append(error)
+        self.net.adapt(self.rates * error)
+
+    def _roulette(self, values: list[float]) -> int:
+        """A segment drawn with the probabilities of equation 11."""
+        best = max(values)
+        wheel = list(accumulate(math.exp((v - best) / self.temperature) for v in values))
+        ball = self.rng.random() * wheel[-1]
+        return next(j for j, edge in enumerate(wheel) if ball < edge)
+
+    def _code(self, segment: int, scalar: float) -> list[float]:
+        """The action vector a of equation 9."""
+        if self.coding == "onehot":
+            return [float(j == segment) for j in range(self.segments)]
+        if self.coding == "wheels":
+            forward, turn = 1 - abs(scalar), TURN * scalar
+            return [forward - turn, forward + turn]
+        return [scalar]
+
+    def _inputs(self, x: Tensor) -> Tensor:
+        """Network inputs: the state (1, n), or with every action (J, n + 1)."""
+        if self.coding != "antecedent":
+            return x[None]
+        return torch.cat([x.expand(self.segments, -1), self.codes], 1)
+
+    def _tensor(self, observation: np.ndarray) -> Tensor:
+        return torch.as_tensor(observation).to(self.net.default_width)
+
+    def _command(self, scalar: float) -> np.ndarray:
+        return np.array([scalar], np.float32)

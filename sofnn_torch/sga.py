@@ -1,0 +1,212 @@
+"""Stochastic gradient ascent on a fuzzy network (section 3 of the paper, equations 4-8).
+
+The network concludes the mean and the standard deviation of each action, and, for the learned
+baseline, the value of the state. One decision of the learner:
+
+    mu_j, sigma_j = network(x)                                             (eq. 4)
+    a_j ~ N(mu_j, sigma_j)                                                 (eq. 5)
+    e = d ln pi(a | x) / dW,   E <- e + gamma lambda E                     (eq. 6; lambda = 1)
+    W <- W + alpha (1 - gamma) (r - b) E                                   (eqs 7, 8)
+
+The gradient e comes from autograd for every w in W = {u, v, mu, sigma}. The baseline b is a
+constant, as in the paper, or the change of a value V learned on the same rules by TD(lambda)
+(Kimura & Kobayashi, ICML 1998): b = V(x_t) - gamma V(x_t+1) makes r - b the TD error.
+"""
+
+import math
+from typing import Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sofnn_torch.sofnn import SOFNN
+
+Actions = Literal["three", "steer", "wheels"]
+RIGHT, STRAIGHT, LEFT = 0, 1, 2
+
+
+def log_likelihood(action: Tensor, mean: Tensor, deviation: Tensor) -> Tensor:
+    """Logarithm of equation 5, with sigma outside the root. Shape: that of the arguments."""
+    z = (action - mean) / deviation
+    return -0.5 * z * z - deviation.log() - 0.5 * math.log(2 * math.pi)
+
+
+def n_actions(actions: Actions) -> int:
+    """Length of the action vector a: 2 for wheel speeds, 1 otherwise."""
+    return 2 if actions == "wheels" else 1
+
+
+class SGA:
+    """The learner of section 3. Rows of the consequents: mu (m), sigma (m), value (1 if learned).
+
+    Args:
+        net: network with ``2 m`` outputs, ``2 m + 1`` with a learned baseline.
+        actions: what the robot takes. ``three``: the scalar a is cut at -1/3 and 1/3 into right
+            turn, straight, left turn. ``steer``, ``wheels``: the vector a itself, clipped by the
+            environment to [-1, 1].
+        gamma: discount per decision.
+        trace_decay: lambda; the paper's equation 6 has 1.
+        baseline: ``constant`` is the paper's b, ``value`` learns it.
+        constant: the constant b.
+        rate_mean: learning rate of the mu consequents.
+        rate_deviation: learning rate of the sigma consequents.
+        rate_centre: learning rate of the centres u.
+        rate_width: learning rate of the widths v.
+        rate_value: learning rate of the value consequents.
+        one_minus_gamma: multiply the policy's rates by (1 - gamma) as equation 8 prints.
+        variance_scaled: multiply the eligibility of each action by its sigma^2 (Williams 1992),
+            so that steps do not explode as sigma shrinks.
+        sigma_min: lower bound of sigma.
+        sigma_max: upper bound of sigma.
+        mean_limit: bound of the absolute value of mu.
+        seed: seed of the action sampling.
+
+    Raises:
+        ValueError: the network has another number of outputs, or the bounds are not ordered.
+    """
+
+    def __init__(
+        self,
+        net: SOFNN,
+        *,
+        actions: Actions = "three",
+        gamma: float = 0.99,
+        trace_decay: float = 0.8,
+        baseline: Literal["constant", "value"] = "value",
+        constant: float = 0.0,
+        rate_mean: float = 0.3,
+        rate_deviation: float = 0.3,
+        rate_centre: float = 0.0,
+        rate_width: float = 0.0,
+        rate_value: float = 0.5,
+        one_minus_gamma: bool = False,
+        variance_scaled: bool = True,
+        sigma_min: float = 0.03,
+        sigma_max: float = 1.0,
+        mean_limit: float = 1.0,
+        seed: int = 0,
+    ):
+        m = n_actions(actions)
+        learned = baseline == "value"
+        if net.n_outputs != 2 * m + learned:
+            raise ValueError(
+                f"SGA needs {2 * m + learned} outputs, the network has {net.n_outputs}"
+            )
+        if not 0 < sigma_min <= sigma_max:
+            raise ValueError(f"need 0 < sigma_min <= sigma_max, got {sigma_min} and {sigma_max}")
+        self.net, self.actions, self.m = net, actions, m
+        self.gamma, self.decay, self.learned, self.constant = (
+            gamma,
+            gamma * trace_decay,
+            learned,
+            constant,
+        )
+        self.variance_scaled, self.mean_limit = variance_scaled, mean_limit
+        self.sigma_min, self.sigma_max = sigma_min, sigma_max
+        self.rng = np.random.default_rng(seed)
+        self.antecedents = rate_centre > 0 or rate_width > 0
+        scale = 1 - gamma if one_minus_gamma else 1.0
+        rates = [rate_mean * scale] * m + [rate_deviation * scale] * m + [rate_value] * learned
+        if self.antecedents:
+            n = net.n_inputs
+            rates = [rate_centre * scale] * n + [rate_width * scale] * n + rates
+        self.rates = net.default_width.new_tensor(rates)[:, None]
+        self.value = 0.0
+        self._log = {"mu": [], "sigma": [], "error": [], "firing": []}
+
+    def start(self, observation: np.ndarray) -> int | np.ndarray:
+        """Begin a trial at the observation (n,): clear the traces, choose the first action."""
+        self.net.traces.zero_()
+        x = self._tensor(observation)
+        return self._choose(x, self.net.observe(x))
+
+    def step(
+        self, reward: float, observation: np.ndarray, terminated: bool
+    ) -> int | np.ndarray | None:
+        """Learn from the reward of the last action, then choose the next (None at the end)."""
+        x = self._tensor(observation)
+        if terminated:
+            self._learn(reward - self.value if self.learned else reward - self.constant)
+            return None
+        firing = self.net.observe(x)
+        error = reward - self.constant
+        if self.learned:
+            following = (firing @ self.net.learnable(False).detach()[-1]).item()
+            error = reward + self.gamma * following - self.value
+        self._learn(error)
+        return self._choose(x, firing)
+
+    def act(self, observation: np.ndarray, explore: bool = False) -> int | np.ndarray:
+        """The mean action, or a sampled one; learns nothing and adds no rule."""
+        with torch.no_grad():
+            outputs = self.net(self._tensor(observation)[None])[0].tolist()
+        mean, sigma = np.array(outputs[: self.m]), np.array(outputs[self.m : 2 * self.m])
+        return self._command(self.rng.normal(mean, sigma) if explore else mean)
+
+    def statistics(self) -> dict[str, float]:
+        """Means over the decisions since the last call (docs/metrics.md); starts afresh."""
+        log, self._log = self._log, {name: [] for name in self._log}
+        if not log["mu"]:
+            return {}
+        mu, sigma = torch.cat(log["mu"]), torch.cat(log["sigma"])
+        error = torch.tensor(log["error"] or [0.0])
+        return {
+            "policy/mu_mean": mu.mean().item(),
+            "policy/mu_deviation": mu.std(unbiased=False).item(),
+            "policy/sigma_mean": sigma.mean().item(),
+            "policy/sigma_min": sigma.min().item(),
+            "learning/error_rms": error.square().mean().sqrt().item(),
+        } | self.net.statistics(log["firing"])
+
+    def state_dict(self) -> dict:
+        """Everything that the future depends on, as tensors, numbers and text."""
+        rng = self.rng.bit_generator.state
+        return {"net": self.net.state_dict(), "rng": rng, "value": self.value}
+
+    def load_state_dict(self, state: dict) -> None:
+        """Counterpart of `state_dict`; a fresh learner takes the size of the stored network."""
+        self.net.load_state_dict(state["net"])
+        self.rng.bit_generator.state = state["rng"]
+        self.value = state["value"]
+
+    def _choose(self, x: Tensor, firing: Tensor) -> int | np.ndarray:
+        """Sample an action (eq. 5) and add its eligibility to the traces (eq. 6)."""
+        net, m = self.net, self.m
+        parameters = net.learnable(self.antecedents)
+        if self.antecedents:
+            firing = net.normalised_firing(x[None], parameters)
+        consequents = parameters[-net.n_outputs :]
+        outputs = consequents[: 2 * m] @ firing[0]
+        mean, deviation = outputs[:m], outputs[m:]
+        noise = torch.from_numpy(self.rng.standard_normal(m)).to(outputs)
+        action = (mean + deviation * noise).detach()
+        likelihood = log_likelihood(action, mean, deviation)
+        if self.variance_scaled:
+            likelihood = likelihood * deviation.detach() ** 2
+        objective = likelihood.sum()
+        if self.learned:  # its gradient is the trace of TD(lambda); it does not move antecedents
+            value = consequents[-1] @ firing[0].detach()
+            self.value = value.item()
+            objective = objective + value
+        net.accumulate(torch.autograd.grad(objective, parameters)[0], self.decay)
+        self._log["mu"].append(mean.detach())
+        self._log["sigma"].append(deviation.detach())
+        self._log["firing"].append(net.max_firing)
+        return self._command(action.numpy())
+
+    def _learn(self, error: float) -> None:
+        """Equations 7 and 8 for the reinforcement error r - b, then the bounds of mu and sigma."""
+        net, m = self.net, self.m
+        self._log["error"].append(error)
+        net.adapt(self.rates * error)
+        net.clamp_consequents(0, m, -self.mean_limit, self.mean_limit)
+        net.clamp_consequents(m, 2 * m, self.sigma_min, self.sigma_max)
+
+    def _tensor(self, observation: np.ndarray) -> Tensor:
+        return torch.as_tensor(observation).to(self.net.default_width)
+
+    def _command(self, action: np.ndarray) -> int | np.ndarray:
+        if self.actions != "three":
+            return np.clip(action, -1, 1).astype(np.float32)
+        return RIGHT if action[0] < -1 / 3 else LEFT if action[0] > 1 / 3 else STRAIGHT

@@ -1,0 +1,198 @@
+"""Q-learning against the paper's closed forms, the roulette's law and brute force (eqs 9-15)."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import stats
+
+from sofnn_torch.qlearning import QLearning, code_length
+from sofnn_torch.sofnn import SOFNN
+
+N, TAU = 3, 2 * math.pi
+CODINGS = ["scalar", "wheels", "onehot", "antecedent"]
+RATES = {
+    "rate_state": 0.1,
+    "rate_action": 0.2,
+    "rate_constant": 0.3,
+    "rate_centre": 0.01,
+    "rate_width": 0.02,
+}
+
+
+def learner(coding="onehot", rules=25, seed=0, segments=3, n_outputs=None, **settings):
+    torch.manual_seed(seed)
+    inputs = N + (coding == "antecedent")
+    outputs = n_outputs or N + code_length(coding, segments) + 1
+    net = SOFNN(
+        inputs,
+        outputs,
+        width=[0.3, 0.3, 1.0, 0.5][:inputs],
+        theta=0.5,
+        periods=[0, 0, TAU, 0][:inputs],
+        block_size=8,
+        dtype=torch.float64,
+    )
+    for _ in range(rules):
+        centre = torch.rand(inputs).double() * 2 - 1
+        centre[2] *= math.pi
+        net.add_rule(centre, 0.2 + torch.rand(inputs).double(), torch.randn(outputs).double())
+    return QLearning(net, N, coding=coding, segments=segments, seed=seed, **settings)
+
+
+def closed_form(net, x, features):
+    """Gradient of Q by the paper's equations 14 and 15, with x_i read as a_i for c_a."""
+    u, v, c = net.centres.T, net.widths.T, net.consequents.T
+    difference = x[:, None] - u
+    difference[2] = torch.remainder(difference[2] + math.pi, TAU) - math.pi
+    firing = (-0.5 * (difference / v) ** 2).sum(0).exp()
+    s = firing / firing.sum()
+    f = features @ c
+    q = (s * f).sum()
+    centres = (1 / v) * (difference / v) * s * (f - q)
+    widths = (1 / v) * (difference / v) ** 2 * s * (f - q)
+    return q, torch.cat([centres, widths, s * features[:, None]])
+
+
+def chosen(agent, command, x):
+    """Features (x, a, 1) and network input of the action that was taken, from the command."""
+    scalar = agent.representatives[command] if agent.actions == "three" else float(command[0])
+    if agent.coding == "onehot":
+        code = [float(j == command) for j in range(agent.segments)]
+    elif agent.coding == "wheels":
+        code = [1 - abs(scalar) - 0.4 * scalar, 1 - abs(scalar) + 0.4 * scalar]
+    else:
+        code = [scalar]
+    code = torch.tensor(code, dtype=torch.float64)
+    state = torch.cat([x, code]) if agent.coding == "antecedent" else x
+    return torch.cat([x, code, torch.ones(1).double()]), state
+
+
+@settings(max_examples=80, deadline=None)
+@given(
+    seed=st.integers(0, 10_000),
+    coding=st.sampled_from(CODINGS),
+    heading=st.floats(-math.pi, math.pi),
+)
+def test_autograd_is_the_closed_form_of_equations_14_and_15(seed, coding, heading):
+    actions = "three" if coding in ("onehot", "wheels") else "steer"
+    agent = learner(coding, seed=seed, actions=actions, trace_limit=None, **RATES)
+    x = torch.tensor([0.2, -0.3, heading], dtype=torch.float64)
+    command = agent.start(x.numpy())
+    features, state = chosen(agent, command, x)
+    q, gradient = closed_form(agent.net, state, features)
+    # The environment takes float32 actions; the learner works with the unrounded one.
+    tolerance = 1e-6 if actions == "three" else 1e-5
+    assert agent.value == pytest.approx(q.item(), rel=tolerance, abs=tolerance)
+    torch.testing.assert_close(agent.net.traces, gradient, rtol=tolerance, atol=tolerance)
+
+
+def test_one_step_is_the_semi_gradient_update_with_the_brute_force_maximum():
+    agent = learner("wheels", gamma=0.9, trace_decay=0.0, trace_limit=None, **RATES)
+    x, following = torch.tensor([0.2, -0.3, 0.5]).double(), torch.tensor([0.3, 0.1, -2.0]).double()
+    command = agent.start(x.numpy())
+    features, _ = chosen(agent, command, x)
+    q, gradient = closed_form(agent.net, x, features)
+    best = max(
+        closed_form(agent.net, following, chosen(agent, j, following)[0])[0].item()
+        for j in range(3)
+    )
+    before = agent.net.table().detach().clone()
+    agent.step(0.5, following.numpy(), False)
+    rates = [0.01] * N + [0.02] * N + [0.1] * N + [0.2] * 2 + [0.3]
+    error = 0.5 + 0.9 * best - q.item()
+    expected = before + torch.tensor(rates).double()[:, None] * error * gradient
+    torch.testing.assert_close(agent.net.table().detach(), expected)
+
+
+@pytest.mark.parametrize("coding", CODINGS)
+def test_action_values_agree_with_rule_by_rule_sums(coding):
+    agent = learner(coding)
+    x = torch.tensor([0.2, -0.3, 0.5]).double()
+    values = agent.action_values(x, agent._firing(x))
+    for j in range(3):
+        features, state = chosen(agent, j, x)
+        q, _ = closed_form(agent.net, state, features)
+        assert values[j].item() == pytest.approx(q.item(), rel=1e-9)
+
+
+def test_the_roulette_follows_equation_11():
+    agent = learner(temperature=0.7)
+    values = [0.3, 1.0, -0.4]
+    draws = np.bincount([agent._roulette(values) for _ in range(6000)], minlength=3)
+    p = np.exp(np.array(values) / 0.7)
+    assert stats.chisquare(draws, 6000 * p / p.sum()).pvalue > 1e-3
+
+
+def test_the_roulette_survives_large_values():
+    agent = learner(temperature=1e-3)
+    assert agent._roulette([1e6, 1e6 - 1, -1e9]) == 0
+
+
+def test_actions_are_uniform_inside_their_segment():
+    agent = learner("scalar", actions="steer", segments=4, temperature=1e9)
+    sample = np.array([agent.start(np.zeros(3))[0] for _ in range(4000)])
+    assert stats.kstest(sample, "uniform", args=(-1, 2)).pvalue > 1e-3
+
+
+def test_a_linear_scalar_action_never_prefers_the_middle():
+    for seed in range(30):
+        agent = learner("scalar", seed=seed)
+        assert agent.act(np.array([0.1, 0.2, 0.3])) != 1
+
+
+@pytest.mark.parametrize("coding", ["onehot", "wheels", "antecedent"])
+def test_other_codings_can_prefer_the_middle(coding):
+    agents = [learner(coding, seed=seed) for seed in range(40)]
+    assert 1 in [agent.act(np.array([0.1, 0.2, 0.3])) for agent in agents]
+
+
+def test_traces_are_cut_at_other_than_greedy_actions():
+    agent = learner(temperature=1e6, trace_decay=0.9, gamma=1.0, trace_limit=None)
+    x = np.array([0.1, 0.2, 0.3])
+    agent.start(x)
+    for _ in range(40):
+        before = agent.net.traces.clone()
+        agent.step(0.0, x, False)
+        s = agent.net.normalised_firing(torch.from_numpy(x)[None])[0]
+        carried = agent.net.traces[-1] - s  # the row of c always has the gradient S
+        kept = 0.9 * before[-1] if agent._log["greedy"][-1] else torch.zeros_like(s)
+        torch.testing.assert_close(carried, kept)
+    assert len(set(agent._log["greedy"])) == 2
+
+
+def test_traces_stay_within_their_limit():
+    agent = learner(rules=1, trace_decay=1.0, gamma=1.0, trace_cut=False, trace_limit=1.0)
+    agent.start(np.zeros(3))
+    for _ in range(10):
+        agent.step(0.0, np.zeros(3), False)
+    assert agent.net.traces[-1].max() == 1.0
+
+
+def test_a_grown_learner_restores_bit_for_bit():
+    xs = np.random.default_rng(1).uniform(-1, 1, (60, 3))
+    agent = learner("antecedent", rules=0)
+    agent.start(xs[0])
+    for x in xs[1:30]:
+        agent.step(-1.0, x, False)
+    twin = learner("antecedent", rules=0, seed=4)
+    twin.load_state_dict(agent.state_dict())
+    for x in xs[30:]:
+        assert agent.step(-1.0, x, False) == twin.step(-1.0, x, False)
+    assert torch.equal(agent.net.table(), twin.net.table())
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"n_outputs": 5}, "outputs"),
+        ({"segments": 4}, "3 segments"),
+        ({"temperature": 0.0}, "temperature"),
+    ],
+)
+def test_wrong_settings_are_refused(settings, message):
+    with pytest.raises(ValueError, match=message):
+        learner(**settings)

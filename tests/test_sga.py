@@ -1,0 +1,204 @@
+"""SGA against the closed forms of its gradients and hand-computed updates (eqs 4-8)."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sofnn_torch.sga import LEFT, RIGHT, SGA, STRAIGHT, log_likelihood
+from sofnn_torch.sofnn import SOFNN
+
+N, TAU = 3, 2 * math.pi
+ADAPTIVE = {"rate_centre": 1e-3, "rate_width": 1e-3, "rate_mean": 0.05, "rate_deviation": 1e-3}
+
+
+def learner(m=1, rules=30, seed=0, baseline="value", n_outputs=None, **settings):
+    torch.manual_seed(seed)
+    learned = int(baseline == "value")
+    net = SOFNN(
+        N,
+        n_outputs or 2 * m + learned,
+        width=[0.3, 0.3, 1.0],
+        theta=0.5,
+        periods=[0, 0, TAU],
+        initial=0.3,
+        block_size=8,
+        dtype=torch.float64,
+    )
+    for _ in range(rules):
+        consequents = torch.cat([torch.rand(m) - 0.5, 0.2 + torch.rand(m), torch.rand(learned)])
+        centre, width = torch.rand(N) * 2 - 1, 0.2 + torch.rand(N)
+        centre[2] *= math.pi
+        net.add_rule(centre.double(), width.double(), consequents.double())
+    actions = "wheels" if m == 2 else "steer"
+    return SGA(net, actions=actions, baseline=baseline, seed=seed, **settings)
+
+
+def closed_form(net, x, action, m):
+    """The gradients of ln pi by hand, in the notation of equations 4 and 5. Shape: (2n+2m, K)."""
+    u, v, c = net.centres.T, net.widths.T, net.consequents.T
+    difference = x[:, None] - u
+    difference[2] = torch.remainder(difference[2] + math.pi, TAU) - math.pi
+    firing = (-0.5 * (difference / v) ** 2).sum(0).exp()
+    s = firing / firing.sum()
+    gradient = torch.zeros(2 * N + 2 * m, net.n_rules, dtype=torch.float64)
+    for j in range(m):
+        mu, sigma = (s * c[j]).sum(), (s * c[m + j]).sum()
+        by_mu = (action[j] - mu) / sigma**2
+        by_sigma = ((action[j] - mu) ** 2 - sigma**2) / sigma**3
+        bracket = by_mu * (c[j] - mu) + by_sigma * (c[m + j] - sigma)
+        gradient[:N] += bracket * s * difference / v**2
+        gradient[N : 2 * N] += bracket * s * difference**2 / v**3
+        gradient[2 * N + j] = s * by_mu
+        gradient[2 * N + m + j] = s * by_sigma
+    return gradient
+
+
+@settings(max_examples=80, deadline=None)
+@given(
+    seed=st.integers(0, 10_000),
+    m=st.sampled_from([1, 2]),
+    heading=st.floats(-math.pi, math.pi),
+    grow=st.booleans(),
+)
+def test_autograd_eligibility_is_the_closed_form(seed, m, heading, grow):
+    agent = learner(m, seed=seed, variance_scaled=False, baseline="constant", **ADAPTIVE)
+    x = torch.tensor([0.3, -0.2, heading], dtype=torch.float64)
+    if grow:
+        agent.net.add_rule(x + 0.4)
+    noise = np.random.default_rng(seed).standard_normal(m)
+    agent.start(x.numpy())
+    outputs = agent.net(x[None])[0].detach()
+    action = outputs[:m] + outputs[m:] * torch.from_numpy(noise)
+    expected = closed_form(agent.net, x, action, m)
+    torch.testing.assert_close(agent.net.traces, expected, rtol=1e-6, atol=1e-6)
+
+
+def test_variance_scaling_multiplies_each_action_by_its_variance():
+    plain = learner(1, variance_scaled=False, baseline="constant", **ADAPTIVE)
+    scaled = learner(1, variance_scaled=True, baseline="constant", **ADAPTIVE)
+    x = np.array([0.1, 0.2, 0.3])
+    plain.start(x)
+    scaled.start(x)
+    variance = plain.net(torch.from_numpy(x)[None])[0, 1].item() ** 2
+    torch.testing.assert_close(scaled.net.traces, plain.net.traces * variance)
+
+
+def test_traces_accumulate_with_gamma_lambda():
+    agent = learner(baseline="constant", gamma=0.9, trace_decay=0.5, sigma_max=9)
+    x = np.array([0.1, 0.2, 0.3])
+    agent.start(x)
+    first = agent.net.traces.clone()
+    agent.step(0.0, x, False)  # without reward nothing is learned: W, and so e, stay
+    noise = np.random.default_rng(0).standard_normal(2)
+    torch.testing.assert_close(
+        agent.net.traces[-2], 0.45 * first[-2] + first[-2] * noise[1] / noise[0]
+    )
+
+
+@pytest.mark.parametrize("factor", [True, False])
+def test_one_step_follows_equations_7_and_8(factor):
+    rates = dict(ADAPTIVE, rate_mean=0.05, rate_deviation=0.002)
+    agent = learner(
+        baseline="constant", constant=0.25, gamma=0.99, one_minus_gamma=factor, sigma_max=9, **rates
+    )
+    agent.start(np.array([0.1, 0.2, 0.3]))
+    before, traces = agent.net.table().detach().clone(), agent.net.traces.clone()
+    agent.step(1.0, np.array([0.1, 0.2, 0.4]), True)
+    alpha = torch.tensor([1e-3] * 6 + [0.05, 0.002])[:, None].double() * (0.01 if factor else 1)
+    torch.testing.assert_close(agent.net.table().detach(), before + alpha * 0.75 * traces)
+
+
+def test_value_baseline_learns_by_the_td_error():
+    agent = learner(gamma=0.9, rate_value=0.5)
+    x, following = np.array([0.1, 0.2, 0.3]), np.array([0.4, -0.2, 0.8])
+    agent.start(x)
+    values = agent.net.consequents[:, -1].clone()
+    s = agent.net.normalised_firing(torch.from_numpy(x)[None])[0]
+    v = (s * values).sum()
+    v_next = (agent.net.normalised_firing(torch.from_numpy(following)[None])[0] * values).sum()
+    agent.step(0.2, following, False)
+    expected = values + 0.5 * (0.2 + 0.9 * v_next - v) * s
+    torch.testing.assert_close(agent.net.consequents[:, -1], expected)
+
+
+def test_the_end_of_a_trial_has_no_following_value():
+    agent = learner(rate_value=0.5)
+    x = np.array([0.1, 0.2, 0.3])
+    agent.start(x)
+    before, s = (
+        agent.net.consequents[:, -1].clone(),
+        agent.net.normalised_firing(torch.tensor(x)[None])[0],
+    )
+    assert agent.step(1.0, x, True) is None
+    expected = before + 0.5 * (1 - (s * before).sum()) * s
+    torch.testing.assert_close(agent.net.consequents[:, -1], expected)
+
+
+def test_sigma_and_mu_stay_in_bounds():
+    agent = learner(rate_mean=1e4, rate_deviation=1e4, sigma_min=0.05, sigma_max=0.7)
+    x = np.array([0.1, 0.2, 0.3])
+    agent.start(x)
+    for k in range(50):
+        agent.step((-1.0) ** k, x, False)
+        c = agent.net.consequents
+        assert c[:, 0].abs().max() <= 1
+        assert c[:, 1].min() >= 0.05 - 1e-12
+        assert c[:, 1].max() <= 0.7 + 1e-12
+
+
+def test_sampled_actions_have_the_moments_of_equation_5():
+    agent = learner(rules=1)
+    agent.net.blocks[0].data[-3:-1, 0] = torch.tensor([0.1, 0.2])
+    x = np.array([0.0, 0.0, 0.0])
+    sample = np.array([agent.act(x, explore=True)[0] for _ in range(4000)])
+    assert sample.mean() == pytest.approx(0.1, abs=0.015)
+    assert sample.std() == pytest.approx(0.2, abs=0.01)
+    assert agent.act(x)[0] == pytest.approx(0.1)
+
+
+def test_log_likelihood_is_the_normal_density():
+    a, mu, sigma = torch.tensor([0.3, -1.0]), torch.tensor([0.1, 0.0]), torch.tensor([0.5, 2.0])
+    expected = torch.distributions.Normal(mu, sigma).log_prob(a)
+    torch.testing.assert_close(log_likelihood(a, mu, sigma), expected)
+
+
+@pytest.mark.parametrize(
+    ("mean", "command"), [(-0.9, RIGHT), (-0.3, STRAIGHT), (0.3, STRAIGHT), (0.9, LEFT)]
+)
+def test_the_scalar_is_cut_into_three_actions(mean, command):
+    agent = learner(rules=1)
+    agent.actions = "three"
+    agent.net.blocks[0].data[-3, 0] = mean
+    assert agent.act(np.zeros(3)) == command
+
+
+def test_acting_changes_nothing_and_adds_no_rule():
+    agent = learner()
+    before = agent.net.table().detach().clone()
+    agent.act(np.array([50.0, 50.0, 0.0]), explore=True)
+    torch.testing.assert_close(agent.net.table().detach(), before)
+
+
+def test_a_restored_learner_continues_bit_for_bit():
+    xs = np.random.default_rng(1).uniform(-1, 1, (60, 3))
+    agent = learner(rules=0)
+    agent.start(xs[0])
+    for x in xs[1:30]:
+        agent.step(0.01, x, False)
+    twin = learner(rules=0, seed=5)
+    twin.load_state_dict(agent.state_dict())
+    for x in xs[30:]:
+        assert np.array_equal(agent.step(0.01, x, False), twin.step(0.01, x, False))
+    assert torch.equal(agent.net.table(), twin.net.table())
+    assert torch.equal(agent.net.traces, twin.net.traces)
+
+
+def test_wrong_networks_and_bounds_are_refused():
+    with pytest.raises(ValueError, match="outputs"):
+        learner(n_outputs=5, rules=0)
+    with pytest.raises(ValueError, match="sigma_min"):
+        learner(sigma_min=0.5, sigma_max=0.1)
