@@ -1,0 +1,44 @@
+"""Make the pictures of the README from a run: python docs/make_images.py RUN."""
+
+import sys
+from pathlib import Path
+
+from sofnn_torch import figures
+from sofnn_torch.config import make_env
+from sofnn_torch.evaluate import load
+from sofnn_torch.physics import load_model
+from sofnn_torch.rendering import OffscreenRenderer
+
+OUT = Path(__file__).parent / "images"
+SIZE = 840  # pixels of a rendered picture
+
+
+def main(run: Path) -> None:
+    """Play one trial and draw the robot, its path and its policy."""
+    config, agent, _, _ = load(run)
+    env = make_env(config)
+    renderer = OffscreenRenderer(load_model(), SIZE, SIZE)
+    trail: list[tuple[float, float]] = []
+    env.on_simulator_step = lambda: trail.append(env.physics.position())
+    observation, _ = env.reset(seed=1000)
+    over, close_up = False, None
+    while not over:
+        observation, _, terminated, truncated, _ = env.step(agent.act(observation))
+        over = terminated or truncated
+        if close_up is None and len(trail) > 120:
+            close_up = renderer.draw(env.physics.data.qpos, trail, camera="chase")
+    from_above = renderer.draw(env.physics.data.qpos, trail)
+
+    figure, (robot, path, policy) = figures.canvas(3)
+    for ax, picture in ((robot, close_up), (path, from_above)):
+        ax.imshow(picture, extent=(0, 1, 0, 1))
+        ax.set_axis_off()
+    figures.action_field(env.plan, agent, policy)
+    OUT.mkdir(exist_ok=True)
+    (OUT / "learned.png").write_bytes(figures.png(figure, dpi=180))
+    renderer.close()
+    env.close()
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))

@@ -1,0 +1,220 @@
+r"""Checkpoint files: written whole or not at all, read only if every bit is as it was written.
+
+A file is one line of text and a payload (docs/checkpoints.md):
+
+    sofnn-torch checkpoint <format version> <sha256 of version and payload>\n
+    payload: a dictionary of tensors, numbers and text, as written by torch.save
+
+The line has the same form in every format version. Payloads are read with ``weights_only=True``,
+which cannot run code.
+"""
+
+import contextlib
+import copy
+import hashlib
+import io
+import os
+import re
+from pathlib import Path
+from typing import Any
+
+import torch
+
+VERSION = 1
+HEADER = re.compile(rb"sofnn-torch checkpoint (\d{1,9}) ([0-9a-f]{64})\n")
+HEADER_SIZE = 200  # no header line is longer
+NAME = re.compile(r"checkpoint-(\d+)\.pt")
+KINDS = {
+    "config": dict,
+    "trial": int,
+    "total_steps": int,
+    "recent": list,
+    "best": list,
+    "network": dict,
+    "agent": dict,
+    "env": dict,
+}
+
+
+class CheckpointError(ValueError):
+    """A checkpoint cannot be used; the message is one line that says why and what to do."""
+
+
+def save(path: Path, state: dict[str, Any]) -> None:
+    """Write a state atomically: the file at path is the old one or the new one, never a part.
+
+    Raises:
+        OSError: the file system refused; the old file, if any, is untouched.
+    """
+    buffer = io.BytesIO()
+    torch.save(state, buffer)
+    payload = buffer.getvalue()
+    header = b"sofnn-torch checkpoint %d %s\n" % (VERSION, _digest(VERSION, payload))
+    write_atomically(path, header + payload)
+
+
+def load(path: Path) -> dict[str, Any]:
+    """Read the state that `save` wrote.
+
+    Raises:
+        CheckpointError: no such file, not a checkpoint, damaged, or of a newer version.
+    """
+    try:
+        data = Path(path).read_bytes()
+    except OSError as error:
+        raise CheckpointError(f"{path}: cannot be read ({error.strerror})") from None
+    header = HEADER.match(data[:HEADER_SIZE])
+    if header is None:
+        raise CheckpointError(f"{path}: not a checkpoint of sofnn-torch")
+    version, payload = int(header[1]), data[header.end() :]
+    if header[2] != _digest(version, payload):
+        raise CheckpointError(
+            f"{path}: damaged or cut off (its checksum differs); use an earlier checkpoint"
+        )
+    if version > VERSION:
+        raise CheckpointError(
+            f"{path}: format {version}, this program reads up to {VERSION}; update sofnn-torch"
+        )
+    try:
+        state = torch.load(io.BytesIO(payload), weights_only=True)
+    except Exception as error:  # torch raises many kinds for a payload it does not know
+        reason = str(error).partition("\n")[0]
+        raise CheckpointError(f"{path}: not a checkpoint of sofnn-torch ({reason})") from None
+    _check_kinds(path, state)
+    return state
+
+
+def restore(path: Path, state: dict[str, Any], agent, env) -> None:
+    """Put a loaded state into an agent and an environment made from the same settings.
+
+    Raises:
+        CheckpointError: shapes or entries do not fit; agent and env must not be used then.
+    """
+    fresh = snapshot(agent, env)
+    reason = _misfit({part: fresh[part] for part in ("agent", "env")}, state)
+    try:
+        if not reason:
+            agent.load_state_dict(state["agent"])
+            env.load_state_dict(state["env"])
+            reason = _misfit(describe(agent.net), state["network"])
+            if not reason and state["network"] != describe(agent.net):
+                reason = f"{state['network']}"
+    except Exception as error:  # any misfit raises something else: sizes, values
+        reason = " ".join(str(error).split())
+    if reason:
+        raise CheckpointError(f"{path}: does not fit its settings ({reason[:200]})")
+
+
+def _misfit(expected: Any, found: Any, name: str = "state") -> str:
+    """The first place where found has another type than expected; empty if there is none."""
+    if type(found) is not type(expected):
+        return f"{name} is of type {type(found).__name__}, not {type(expected).__name__}"
+    if isinstance(expected, torch.Tensor) and found.dtype != expected.dtype:
+        return f"{name} holds {found.dtype}, not {expected.dtype}"
+    if isinstance(expected, dict):
+        for key in expected:
+            if key not in found:
+                return f"{name} has no {key}"
+            if reason := _misfit(expected[key], found[key], str(key)):
+                return reason
+    if isinstance(expected, list):
+        if len(expected) != len(found):
+            return f"{name} has {len(found)} entries, not {len(expected)}"
+        pairs = zip(expected, found, strict=True)
+        return next((reason for a, b in pairs if (reason := _misfit(a, b, name))), "")
+    return ""
+
+
+def describe(net) -> dict[str, Any]:
+    """Constructor arguments and size of a network, to check a state against."""
+    return {
+        "n_inputs": net.n_inputs,
+        "n_outputs": net.n_outputs,
+        "rules": net.n_rules,
+        "growth": net.growth,
+        "theta": net.theta,
+        "max_rules": net.max_rules,
+        "blocks": [list(block.shape) for block in net.blocks],
+    }
+
+
+def snapshot(agent, env) -> dict[str, Any]:
+    """A copy of all that the future of agent and env depends on."""
+    # state_dict() of a module refers to the live parameters.
+    return {
+        "network": describe(agent.net),
+        "agent": copy.deepcopy(agent.state_dict()),
+        "env": copy.deepcopy(env.state_dict()),
+    }
+
+
+def checkpoints(directory: Path) -> list[Path]:
+    """The numbered checkpoints of a run, newest first."""
+    found = [path for path in directory.iterdir() if NAME.fullmatch(path.name)]
+    return sorted(found, key=number, reverse=True)
+
+
+def number(path: Path) -> int:
+    """The trial in the name of a numbered checkpoint."""
+    return int(NAME.fullmatch(path.name)[1])
+
+
+def find_latest(directory: Path) -> tuple[Path, dict[str, Any], list[str]]:
+    """The newest checkpoint that can be used, its state, and what is wrong with newer ones.
+
+    Raises:
+        CheckpointError: there is none.
+    """
+    problems = []
+    for path in checkpoints(directory):
+        try:
+            return path, load(path), problems
+        except CheckpointError as error:
+            problems.append(str(error))
+    reason = f" ({problems[0]})" if problems else ""
+    raise CheckpointError(f"{directory}: no checkpoint to go on from{reason}")
+
+
+def write_atomically(path: Path, data: bytes) -> None:
+    """Replace a file by data so that a crash or a full disk leaves the old or the new file.
+
+    Raises:
+        OSError: the file system refused; no part of the new file stays behind.
+    """
+    temporary = path.with_name(f".{path.name}.tmp")
+    try:
+        with open(temporary, "wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
+        raise
+    sync_directory(path.parent)
+
+
+def sync_directory(directory: Path) -> None:
+    """Make renames in a directory survive a power failure, where the system can."""
+    if os.name != "posix":
+        return
+    descriptor = os.open(directory, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _digest(version: int, payload: bytes) -> bytes:
+    digest = hashlib.sha256(b"%d\n" % version)
+    digest.update(payload)
+    return digest.hexdigest().encode()
+
+
+def _check_kinds(path: Path, state: Any) -> None:
+    if not isinstance(state, dict):
+        raise CheckpointError(f"{path}: not a checkpoint of sofnn-torch (no dictionary)")
+    for key, kind in KINDS.items():
+        if type(state.get(key)) is not kind:
+            raise CheckpointError(f"{path}: not a checkpoint of sofnn-torch (no {key})")

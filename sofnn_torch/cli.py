@@ -1,0 +1,183 @@
+"""The command line of training: flags, one clear line for what is wrong, exit codes.
+
+Exit codes: 0 done, 1 diverged or not saved where it should be, 2 bad input, 130 and 143 stopped
+by SIGINT and SIGTERM after saving.
+"""
+
+import argparse
+import contextlib
+import dataclasses
+import io
+import re
+import signal
+import sys
+import threading
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+if __name__ == "__main__":  # Ctrl-C while libraries load: there is nothing to save yet
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+from sofnn_torch import runs, seeds, training
+from sofnn_torch.config import Config, preset
+from sofnn_torch.guard import Divergence, Interrupted
+from sofnn_torch.training import RunOptions
+
+EXAMPLES = """Train a robot to find its way with a self-organizing fuzzy neural network.
+
+Examples:
+  train.py                                     stochastic gradient ascent, growing network
+  train.py --agent q --network fixed --pose true --seed 3 --trials 300
+  train.py --resume runs/sga-sofnn-estimated-s0  go on where a run stopped
+  train.py --seeds 0-7 --workers 2             eight runs, two at a time
+
+Ctrl-C saves. Watch with: tensorboard --logdir runs
+"""
+
+
+@dataclass(frozen=True)
+class Flags:
+    """All flags of the command line."""
+
+    config: Annotated[Config, tyro.conf.arg(name="")]
+    options: Annotated[RunOptions, tyro.conf.arg(name="")]
+    resume: Annotated[Path | None, tyro.conf.arg(metavar="RUN")] = None
+    """Go on with the run in this directory, or from one of its checkpoint files. Its settings
+    are kept; only `--trials` may be raised."""
+    seeds: Annotated[str | None, tyro.conf.arg(metavar="LIST")] = None
+    """Train several seeds, each in its own process and run: `0-7` or `0,3,5`."""
+    workers: int = 1
+    """Seeds that are trained at the same time (with `--seeds`)."""
+    replay: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Play the trial again that follows a saved state, such as a `divergence-12.pt`."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Train as the flags say; the exit code."""
+    argv = list(sys.argv[1:] if argv is None else argv)
+    threading.excepthook = _note_thread
+    try:
+        flags = parse(argv)
+        if flags.replay:
+            training.replay(flags.replay)
+        elif flags.seeds is not None:
+            return seeds.train(flags.config, flags.options, flags.seeds, flags.workers, argv)
+        elif flags.resume:
+            run = training.resume(flags.resume, flags.options, flags.config.trials)
+            print(f"{run}: done")
+        else:
+            print(f"{training.train(flags.config, flags.options)}: done")
+    except ValueError as error:
+        return _fail(error, 2)
+    except (Divergence, OSError) as error:
+        return _fail(error, 1)
+    except Interrupted as stop:
+        if stop.run:
+            print(f"stopped and saved; go on with: {_program()} --resume {stop.run}")
+        return 128 + stop.number
+    return 0
+
+
+def parse(argv: Sequence[str]) -> Flags:
+    """The flags, on top of a preset or of the settings of the run to resume.
+
+    Raises:
+        ValueError: one line on what is wrong.
+        SystemExit: with code 0 after printing the help.
+    """
+    first = _Parser(add_help=False, allow_abbrev=False)
+    for name, value in (("agent", "sga"), ("network", "sofnn"), ("preset", "default")):
+        first.add_argument(f"--{name}", default=value)
+    first.add_argument("--resume", type=Path)
+    known, _ = first.parse_known_args(argv)
+    if known.resume and not {"-h", "--help"} & set(argv):
+        base = training.saved_config(known.resume)
+    else:
+        base = _preset(known)
+    flags = _tyro(argv, Flags(config=base, options=RunOptions()))
+    if flags.resume:
+        _keep_settings(flags, base)
+    for agent in {"sga", "q"} - {flags.config.agent}:
+        if changed := _difference(getattr(flags.config, agent), getattr(base, agent)):
+            flag = _flag(f"{agent}.{changed}")
+            raise ValueError(f"{flag} has no effect with --agent {flags.config.agent}")
+    if flags.workers < 1:
+        raise ValueError(f"--workers must be at least 1, got {flags.workers}")
+    return flags
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> None:
+        raise ValueError(message)
+
+
+def _preset(known: argparse.Namespace) -> Config:
+    if known.network not in ("sofnn", "fixed"):
+        raise ValueError(f"--network must be sofnn or fixed, got {known.network!r}")
+    return preset(known.agent, known.network, known.preset)
+
+
+def _tyro(argv: Sequence[str], default: Flags) -> Flags:
+    """Parse with tyro, its framed messages made one line."""
+    messages = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(messages):
+            return tyro.cli(Flags, default=default, args=argv, description=EXAMPLES)
+    except SystemExit as stop:
+        if not stop.code:
+            raise
+    lines = [line.strip("│ ") for line in messages.getvalue().splitlines()]
+    lines = [line for line in lines if line and not line.startswith("╭")]
+    what = " ".join(lines[: next((i for i, x in enumerate(lines) if x.startswith("─")), 1)])
+    hint = next((m[1] for line in lines[1:] if (m := re.match(r"(--[\w.-]+)", line))), None)
+    if hint and "nrecognized" in what:
+        what += f"; did you mean {hint}?"
+    raise ValueError(f"{what} (--help lists all flags)")
+
+
+def _keep_settings(flags: Flags, base: Config) -> None:
+    """Refuse flags that contradict the run to resume."""
+    if flags.seeds is not None or flags.replay:
+        raise ValueError("--resume goes with neither --seeds nor --replay")
+    if flags.resume.is_dir() and flags.options.name is not None:
+        raise ValueError("--name is for new runs; a resumed run keeps its directory")
+    asked = dataclasses.replace(flags.config, trials=base.trials)
+    if name := _difference(asked, base):
+        ours, theirs = (runs.flatten(dataclasses.asdict(c))[name] for c in (asked, base))
+        raise ValueError(
+            f"{_flag(name)} {ours} contradicts {flags.resume}, which has {theirs}: "
+            "a run keeps its settings; only --trials may be raised"
+        )
+
+
+def _difference(ours, theirs) -> str | None:
+    """Name of the first setting that differs."""
+    a, b = (runs.flatten(dataclasses.asdict(settings)) for settings in (ours, theirs))
+    return next((name for name in a if a[name] != b[name]), None)
+
+
+def _flag(name: str) -> str:
+    return f"--{name}".replace("_", "-")
+
+
+def _program() -> str:
+    name = Path(sys.argv[0]).name
+    return name if name.startswith("sofnn") else "python train.py"
+
+
+def _note_thread(failure: threading.ExceptHookArgs) -> None:
+    """One line instead of a traceback: TensorBoard's writer thread on a full disk."""
+    runs.say(f"warning: {failure.thread.name if failure.thread else 'thread'}: {failure.exc_value}")
+
+
+def _fail(error: Exception, code: int) -> int:
+    print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
+    return code
+
+
+if __name__ == "__main__":
+    sys.exit(main())

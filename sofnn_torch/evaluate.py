@@ -1,0 +1,285 @@
+"""Play a learned policy and say how good it is.
+
+    python -m sofnn_torch.evaluate RUN                              # 10 trials, a table
+    python -m sofnn_torch.evaluate RUN --episodes 100 --json result.json
+    python -m sofnn_torch.evaluate RUN --video run.mp4 --viewer
+
+By default the robot takes the mean action (SGA) or the greedy one (Q-learning); with --explore it
+samples its learned stochastic policy. Nothing is learned and the run directory is not changed.
+"""
+
+import dataclasses
+import json
+import math
+import sys
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import imageio.v2 as imageio
+import numpy as np
+import torch
+import tyro
+from rich.console import Console
+from rich.table import Table
+from scipy import stats
+
+from sofnn_torch import checkpoint
+from sofnn_torch.config import Agent, Config, make_agent, make_env
+from sofnn_torch.flags import parse
+from sofnn_torch.monitoring import TrialRecord, film, gif
+from sofnn_torch.optimum import optimal_steps
+from sofnn_torch.runs import load_config, same_settings, say, versions
+from sofnn_torch.training import play
+
+CONFIDENCE = 0.95
+
+
+@dataclass(frozen=True)
+class Options:
+    """Play the learned policy of a run and print steps, success, collisions and pose error."""
+
+    run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    """Directory of the run."""
+    episodes: int = 10
+    """Trials to play."""
+    explore: bool = False
+    """Sample the learned stochastic policy instead of its mean or greedy action."""
+    best: bool = False
+    """Take the checkpoint with the best last 10 trials instead of the latest."""
+    seed: int = 1000
+    """Seed of the motor noise and of the sampled actions."""
+    video: Path | None = None
+    """Write a video of the first trial to this .mp4 or .gif file."""
+    viewer: bool = False
+    """Watch in a window."""
+    json: Path | None = None
+    """Write the results to this file."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A mean or a proportion with its 95 % confidence interval (NaN where there is none)."""
+
+    value: float
+    low: float
+    high: float
+
+
+def check(options: Options) -> None:
+    """Check what can be checked before anything is loaded.
+
+    Raises:
+        ValueError: naming the flag.
+    """
+    if options.episodes < 1:
+        raise ValueError(f"--episodes must be at least 1, got {options.episodes}")
+    if options.seed < 0:
+        raise ValueError(f"--seed must not be negative, got {options.seed}")
+    if options.video and options.video.suffix not in (".mp4", ".gif"):
+        raise ValueError(f"--video must end in .mp4 or .gif, got {options.video}")
+    for flag, path in (("--video", options.video), ("--json", options.json)):
+        if path and (path.is_dir() or not path.parent.is_dir()):
+            raise ValueError(f"{flag} {path}: not a file in an existing directory")
+
+
+def load(run: Path, best: bool = False) -> tuple[Config, Agent, Path, dict[str, Any]]:
+    """Settings, learner, file and state of the latest good checkpoint of a run, or of its best.
+
+    Raises:
+        ValueError: not a run, or no checkpoint that fits it.
+    """
+    config = load_config(run)
+    if best:
+        path = run / "best.pt"
+        state = checkpoint.load(path)
+    else:
+        path, state, problems = checkpoint.find_latest(run)
+        for problem in problems:
+            say(f"warning: {problem}")
+    same_settings(path, state, config)
+    agent, env = make_agent(config), make_env(config)
+    checkpoint.restore(path, state, agent, env)
+    env.close()
+    if agent.net.n_rules == 0:
+        raise ValueError(f"{path}: no rule has been learned yet; train for a trial at least")
+    return config, agent, path, state
+
+
+def evaluate(
+    config: Config,
+    agent: Agent,
+    episodes: int = 10,
+    explore: bool = False,
+    seed: int = 1000,
+    render_mode: str | None = None,
+) -> list[TrialRecord]:
+    """Play trials without learning.
+
+    Args:
+        config: settings of the run.
+        agent: the learner; only its random generator moves, and only if explore.
+        episodes: number of trials.
+        explore: sample the stochastic policy.
+        seed: seed of the motor noise and of the sampled actions.
+        render_mode: ``human`` shows the trials in a window.
+    """
+    env = make_env(config, render_mode=render_mode)
+    try:
+        env.reset(seed=seed)
+        agent.rng = np.random.default_rng(seed)
+        records = []
+        for trial in range(1, episodes + 1):
+            record, _ = play(env, agent, learn=False, explore=explore)
+            records.append(dataclasses.replace(record, trial=trial))
+        return records
+    finally:
+        env.close()
+
+
+def mean(values: Sequence[float], seed: int = 0) -> Estimate:
+    """Mean with its bias-corrected bootstrap interval."""
+    data = np.asarray(values, float)
+    if len(data) == 0:
+        return Estimate(math.nan, math.nan, math.nan)
+    value = float(data.mean())
+    if len(data) == 1:
+        return Estimate(value, math.nan, math.nan)
+    if np.ptp(data) == 0:
+        return Estimate(value, value, value)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # SciPy warns where it falls short of a BCa interval
+        interval = stats.bootstrap(
+            (data,), np.mean, confidence_level=CONFIDENCE, rng=np.random.default_rng(seed)
+        ).confidence_interval
+    return Estimate(value, float(interval.low), float(interval.high))
+
+
+def proportion(successes: int, trials: int) -> Estimate:
+    """Share of successes with its Wilson interval."""
+    interval = stats.binomtest(successes, trials).proportion_ci(CONFIDENCE, method="wilson")
+    return Estimate(successes / trials, float(interval.low), float(interval.high))
+
+
+def summarise(records: Sequence[TrialRecord], optimum: float | None = None) -> dict[str, Estimate]:
+    """The table's rows.
+
+    Args:
+        records: the trials.
+        optimum: steps of the best noise-free run through the maze, if known.
+    """
+    arrived = [r.steps for r in records if r.success]
+    rows = {
+        "success": proportion(len(arrived), len(records)),
+        "steps": mean([r.steps for r in records]),
+        "steps_to_goal": mean(arrived),
+        "collisions": mean([r.collisions for r in records]),
+        "pose_error": mean([r.pose_error for r in records]),
+        "pose_error_max": mean([r.pose_error_max for r in records]),
+        "heading_error": mean([r.heading_error for r in records]),
+    }
+    if optimum:
+        scaled = (value / optimum for value in dataclasses.astuple(rows["steps_to_goal"]))
+        rows["steps_over_optimum"] = Estimate(*scaled)
+    return rows
+
+
+# Name in the results -> text, factor to the printed unit, decimals.
+PRINTED: dict[str, tuple[str, float, int]] = {
+    "success": ("trials that reached the goal, %", 100, 1),
+    "steps_to_goal": ("steps to the goal", 1, 1),
+    "steps_over_optimum": ("  over the kinematic optimum", 1, 3),
+    "steps": ("steps of all trials", 1, 1),
+    "collisions": ("collisions per trial", 1, 2),
+    "pose_error": ("position error, mean, mm", 1000, 2),
+    "pose_error_max": ("position error, largest, mm", 1000, 2),
+    "heading_error": ("heading error, mean, degrees", 180 / math.pi, 2),
+}
+
+
+def table(rows: dict[str, Estimate]) -> Table:
+    """The results for the terminal."""
+    view = Table("", "mean", "95 % interval")
+    for column in view.columns[1:]:
+        column.justify = "right"
+    for name, (text, factor, digits) in PRINTED.items():
+        if name not in rows or (name == "steps" and rows["success"].value == 1):
+            continue
+        value, low, high = (f"{factor * v:.{digits}f}" for v in dataclasses.astuple(rows[name]))
+        interval = "-" if "nan" in (low, high) else f"{low} .. {high}"
+        view.add_row(text, value.replace("nan", "-"), interval)
+    return view
+
+
+def plain(row: Estimate) -> dict[str, float | None]:
+    """An estimate for JSON, which knows no NaN."""
+    return {k: None if math.isnan(v) else v for k, v in dataclasses.asdict(row).items()}
+
+
+def write_video(path: Path, config: Config, agent: Agent, seed: int, explore: bool) -> None:
+    """Film the first trial that `evaluate` plays with the same seed, 30 times as fast as it is."""
+    agent.rng = np.random.default_rng(seed)
+    if path.suffix == ".gif":
+        path.write_bytes(gif(film(config, agent, seed, explore, steps_per_frame=5, size=360)))
+        return
+    with imageio.get_writer(path, fps=30) as writer:
+        for frame in film(config, agent, seed, explore):
+            writer.append_data(frame)
+
+
+def run(options: Options) -> dict[str, Estimate]:
+    """What the command does.
+
+    Raises:
+        ValueError: the run cannot be used or a file cannot be written.
+    """
+    check(options)
+    torch.set_num_threads(1)
+    config, agent, path, state = load(options.run, options.best)
+    policy = "sampled" if options.explore else "mean" if config.agent == "sga" else "greedy"
+    records = evaluate(
+        config,
+        agent,
+        options.episodes,
+        options.explore,
+        options.seed,
+        "human" if options.viewer else None,
+    )
+    env = make_env(config)
+    rows = summarise(records, optimal_steps(env.unwrapped.plan, config.maze.hold).steps)
+    env.close()
+    print(f"{path}: {state['trial']} trials learned, {agent.net.n_rules} rules")
+    print(f"{options.episodes} trials with {policy} actions:")
+    Console().print(table(rows))
+    if options.json:
+        results = {
+            "checkpoint": str(path),
+            "trials_learned": state["trial"],
+            "rules": agent.net.n_rules,
+            "policy": policy,
+            "seed": options.seed,
+            "confidence": CONFIDENCE,
+            "results": {name: plain(row) for name, row in rows.items()},
+            "trials": [dataclasses.asdict(record) for record in records],
+            "config": dataclasses.asdict(config),
+            "versions": versions(),
+        }
+        options.json.write_text(json.dumps(results, indent=2) + "\n")
+    if options.video:
+        write_video(options.video, config, agent, options.seed, options.explore)
+    return rows
+
+
+def main() -> None:
+    """Entry point of ``python -m sofnn_torch.evaluate``."""
+    try:
+        run(parse(Options, sys.argv[1:], __doc__))
+    except (ValueError, OSError, RuntimeError, ArithmeticError) as error:
+        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
+        sys.exit(2)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,94 @@
+"""What may cut a run short: a signal, and numbers that diverge."""
+
+import math
+import signal
+import threading
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from sofnn_torch.config import Agent
+
+FARTHEST = 1e3  # metres, radians: no rule out there ever fires
+LARGEST = 1e9  # no reward and no step size that make sense lead to a consequent beyond this
+WARNINGS = ("BADQPOS", "BADQVEL", "BADQACC", "BADCTRL", "CONTACTFULL", "CNSTRFULL", "INERTIA")
+
+
+class Interrupted(Exception):
+    """A signal asked to stop.
+
+    Attributes:
+        number: of the signal.
+        run: directory of the run, None outside one.
+    """
+
+    def __init__(self, number: int):
+        super().__init__(signal.Signals(number).name)
+        self.number = number
+        self.run: Path | None = None
+
+
+class Divergence(ArithmeticError):
+    """Numbers stopped being finite or sensible; the message says which."""
+
+
+class SignalTrap:
+    """Notes SIGINT and SIGTERM instead of dying of them, so that the loop can stop in order.
+
+    Outside the main thread, where Python allows no handlers, it notes nothing.
+
+    Attributes:
+        number: of the last signal, 0 as long as there was none.
+    """
+
+    def __init__(self) -> None:
+        self.number = 0
+        self._former: dict[int, Any] = {}
+
+    def __enter__(self) -> "SignalTrap":
+        if threading.current_thread() is threading.main_thread():
+            for number in (signal.SIGINT, signal.SIGTERM):
+                self._former[number] = signal.signal(number, self._note)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._former.items():
+            signal.signal(number, handler)
+
+    def _note(self, number: int, _frame: object) -> None:
+        self.number = number
+
+
+def diagnose(agent: Agent, observation: np.ndarray) -> str:
+    """What is not finite, or beyond all sense, in a learner or its input; empty if nothing is."""
+    if not np.isfinite(observation).all():
+        return f"the observation is {observation.tolist()}"
+    net = agent.net
+    if net.n_rules == 0:
+        return ""
+    parts = {
+        "centres": (net.centres, FARTHEST),
+        "widths": (net.widths, FARTHEST),
+        "consequents": (net.consequents, LARGEST),
+        "eligibility traces": (net.traces.T, math.inf),
+    }
+    for name, (values, limit) in parts.items():
+        bad = ~(values.abs() < limit).all(1)  # a NaN is not smaller than anything
+        if bad.any():
+            rule = int(bad.nonzero()[0])
+            worst = ", ".join(f"{value:.3g}" for value in values[rule].tolist())
+            return f"{name} of {int(bad.sum())} of {net.n_rules} rules, as in rule {rule}: {worst}"
+    return ""
+
+
+def physics_warnings(env) -> str:
+    """MuJoCo's warnings since the last reset that make a simulation worthless; empty if none."""
+    physics = getattr(env.unwrapped, "physics", None)
+    if physics is None:
+        return ""
+    counts = physics.data.warning.number
+    kinds = {name: getattr(mujoco.mjtWarning, f"mjWARN_{name}").value for name in WARNINGS}
+    found = [f"{name} x {counts[kind]}" for name, kind in kinds.items() if counts[kind]]
+    return f"MuJoCo warns of {', '.join(found)}" if found else ""

@@ -1,0 +1,299 @@
+"""TensorBoard: scalars, settings, pictures and now and then a video of a training run.
+
+Names and formulas of the metrics are in docs/metrics.md; the horizontal axis is the trial.
+Nothing here touches the learner's random numbers or the training environment, and nothing here
+stops a training: what cannot be written or drawn is said once and left out.
+"""
+
+import dataclasses
+import io
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+from tensorboard.compat.proto.summary_pb2 import Summary
+from torch.utils.tensorboard import SummaryWriter
+from torch.utils.tensorboard.summary import hparams
+
+from sofnn_torch import figures
+from sofnn_torch.config import Agent, Config, make_env
+from sofnn_torch.physics import load_model
+from sofnn_torch.rendering import OffscreenRenderer
+from sofnn_torch.runs import flatten, say
+from sofnn_torch.survey import usage
+
+WINDOW = 10  # trials in the moving success rate
+VIDEO_STEPS = 1000  # a robot that does not find the goal is not filmed for ever
+HPARAM_METRICS = ("trial/steps", "trial/success_last_10", "trial/return", "rules/count")
+
+
+@dataclass(frozen=True)
+class TrialRecord:
+    """What one trial was like; a line of ``trials.csv``. Nothing in it depends on the clock."""
+
+    trial: int
+    """Number of the trial, from 1."""
+    steps: int
+    """Simulator steps until the goal or the limit."""
+    decisions: int
+    """Actions chosen; one is held for up to `hold` steps."""
+    total_steps: int
+    """Simulator steps since the start of the run."""
+    reward: float
+    """Undiscounted sum of the rewards."""
+    success: bool
+    """The goal was reached."""
+    collisions: int
+    """Decisions that ended in a bump."""
+    subgoals: int
+    """Sub-goals found in this trial."""
+    rules: int
+    """Rules after the trial."""
+    pose_error: float
+    """Mean distance of true and estimated position over the decisions, in metres."""
+    pose_error_max: float
+    """The largest of these distances, in metres."""
+    heading_error: float
+    """Mean absolute difference of true and estimated heading, in radians."""
+    statistics: dict[str, float] = field(default_factory=dict)
+    """What the learner measured (`agent.statistics()`)."""
+
+
+@dataclass
+class Trajectory:
+    """Poses (x [m], y [m], heading [rad]) at the start and after every decision of a trial.
+
+    Attributes:
+        true: where the robot was. Shape: (T, 3).
+        estimated: where it believed to be. Shape: (T, 3).
+    """
+
+    true: NDArray[np.float64]
+    estimated: NDArray[np.float64]
+
+
+class Monitor:
+    """Writes a run's progress for TensorBoard into its directory.
+
+    Args:
+        run_dir: directory of the run.
+        config: settings of the run, shown under HPARAMS.
+        first_trial: the trial that comes next; what an interrupted run wrote from there on is
+            hidden, and successes before it are read from ``trials.csv``.
+        picture_every: trials between two sets of pictures, 0 for none.
+        video_every: trials between two videos, 0 for none.
+    """
+
+    def __init__(
+        self,
+        run_dir: Path,
+        config: Config,
+        first_trial: int = 1,
+        picture_every: int = 25,
+        video_every: int = 50,
+    ):
+        self.run_dir, self.config = Path(run_dir), config
+        self.picture_every, self.video_every = picture_every, video_every
+        self.successes: deque[float] = deque(self._earlier_successes(first_trial), maxlen=WINDOW)
+        self._plan = None
+        self._broken: set[str] = set()
+        self._writer: SummaryWriter | None = None
+        self._guard("TensorBoard", lambda: self._open(first_trial))
+
+    def trial(
+        self, record: TrialRecord, path: Trajectory, agent: Agent, steps_per_second: float
+    ) -> None:
+        """Write the scalars of a trial and, when their turn has come, pictures and a video.
+
+        Args:
+            record: the trial.
+            path: where the robot went in it.
+            agent: the learner after the trial.
+            steps_per_second: simulator steps over wall-clock time of the trial.
+        """
+        self.successes.append(record.success)
+        self._guard("TensorBoard", lambda: self._scalars(record, steps_per_second))
+        if self._due(record.trial, self.picture_every):
+            self._guard("pictures", lambda: self._pictures(record.trial, path, agent))
+        if self._due(record.trial, self.video_every):
+            self._guard("video", lambda: self._video(record.trial, agent))
+
+    def flush(self) -> None:
+        """Write what is still in memory."""
+        if self._writer is not None:
+            self._guard("TensorBoard", self._writer.flush)
+
+    def close(self) -> None:
+        """Write what is still in memory and give the file back."""
+        if self._writer is not None:
+            self._guard("TensorBoard", self._writer.close)
+            self._writer = None
+
+    def _guard(self, part: str, action: Callable[[], None]) -> None:
+        """Run an action unless its part failed before; say a failure once and go on without."""
+        if part in self._broken or "TensorBoard" in self._broken:
+            return
+        try:
+            action()
+        except Exception as error:  # disk, GL and drawing fail in many ways; none may end a run
+            self._broken.add(part)
+            reason = " ".join(str(error).split()) or type(error).__name__
+            say(f"warning: no {part} from now on, training goes on ({reason})")
+
+    def _open(self, first_trial: int) -> None:
+        # TensorBoard drops the steps from purge_step on that it has read before, but only where
+        # the earlier file announced a purge step too: hence also in a fresh run.
+        self._writer = SummaryWriter(str(self.run_dir), purge_step=first_trial, flush_secs=10)
+        if first_trial == 1:
+            self._hparams()
+
+    def _hparams(self) -> None:
+        """Write the settings into this run; `SummaryWriter.add_hparams` would make a second."""
+        settings = flatten(dataclasses.asdict(self.config))
+        plain = {
+            name: value if isinstance(value, bool | int | float | str) else str(value)
+            for name, value in settings.items()
+        }
+        for summary in hparams(plain, dict.fromkeys(HPARAM_METRICS)):
+            self._writer.file_writer.add_summary(summary)
+
+    def _scalars(self, record: TrialRecord, steps_per_second: float) -> None:
+        if not any(self.run_dir.glob("events.out.tfevents.*")):  # deleted while the run goes on
+            self._writer.close()
+            self._open(record.trial)
+        values = {
+            "trial/steps": record.steps,
+            "trial/decisions": record.decisions,
+            "trial/return": record.reward,
+            "trial/success": float(record.success),
+            "trial/success_last_10": sum(self.successes) / len(self.successes),
+            "trial/collisions": record.collisions,
+            "trial/subgoals": record.subgoals,
+            "trial/total_steps": record.total_steps,
+            "rules/count": record.rules,
+            "pose/error_mean": record.pose_error,
+            "pose/error_max": record.pose_error_max,
+            "pose/heading_error_mean": record.heading_error,
+            "speed/steps_per_second": steps_per_second,
+        }
+        # One event for all of them: a tenth of the time that one event each takes.
+        scalars = [
+            Summary.Value(tag=k, simple_value=v) for k, v in (values | record.statistics).items()
+        ]
+        self._writer.file_writer.add_summary(Summary(value=scalars), record.trial)
+
+    def _pictures(self, trial: int, path: Trajectory, agent: Agent) -> None:
+        if self._plan is None:
+            env = make_env(self.config)
+            self._plan = env.unwrapped.plan
+            env.close()
+        plan = self._plan
+        drawings = {
+            "trajectory": lambda ax: figures.trajectory(plan, path, ax),
+            "rules": lambda ax: figures.rule_map(plan, agent, ax, usage(agent, path.estimated)),
+            "policy": lambda ax: figures.action_field(plan, agent, ax),
+            "pose_error": lambda ax: figures.pose_error(path, ax, plan),
+        }
+        if getattr(agent, "learned", True):  # an SGA with a constant baseline knows no values
+            drawings["value"] = lambda ax: figures.value_field(plan, agent, ax)
+        for name, draw in drawings.items():
+            figure, (ax,) = figures.canvas(width=5, height=5, tight=False)
+            draw(ax)
+            self._image(f"pictures/{name}", figures.png(figure, dpi=100), trial)
+
+    def _video(self, trial: int, agent: Agent) -> None:
+        frames = film(self.config, agent, steps_per_frame=10, limit=VIDEO_STEPS, size=240)
+        self._image("video/evaluation", gif(frames), trial)
+
+    def _image(self, name: str, data: bytes, trial: int) -> None:
+        width, height = Image.open(io.BytesIO(data)).size
+        image = Summary.Image(width=width, height=height, colorspace=3, encoded_image_string=data)
+        summary = Summary(value=[Summary.Value(tag=name, image=image)])
+        self._writer.file_writer.add_summary(summary, trial)
+
+    @staticmethod
+    def _due(trial: int, every: int) -> bool:
+        return every > 0 and trial % every == 0
+
+    def _earlier_successes(self, first_trial: int) -> NDArray[np.float64]:
+        with suppress(OSError, ValueError):
+            if first_trial > 1:
+                column = figures.read_column(self.run_dir / "trials.csv", "success")
+                return column[max(0, first_trial - 1 - WINDOW) : first_trial - 1]
+        return np.array([])
+
+
+def film(
+    config: Config,
+    agent: Agent,
+    seed: int = 0,
+    explore: bool = False,
+    steps_per_frame: int = 2,
+    limit: int = 20_000,
+    size: int = 480,
+) -> Iterator[NDArray[np.uint8]]:
+    """Frames (size, size, 3) of one trial without learning.
+
+    Args:
+        config: settings of the run.
+        agent: the learner.
+        seed: seed of the motor noise.
+        explore: sample the stochastic policy.
+        steps_per_frame: simulator steps from one frame to the next.
+        limit: steps after which the film ends.
+        size: width and height of the frames in pixels.
+
+    Raises:
+        RenderingError: this machine cannot draw.
+    """
+    env = make_env(config)
+    renderer = OffscreenRenderer(load_model(), size, size)
+    for effect in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
+        renderer.scene.flags[effect] = 0  # four fifths of the time where there is no GPU
+    trail: list[tuple[float, float]] = []
+    frames: list[NDArray[np.uint8]] = []
+
+    def shoot() -> None:
+        frames.append(renderer.draw(env.physics.data.qpos, trail, env.estimator.pose))
+
+    def after_step() -> None:
+        trail.append(env.physics.position())
+        if len(trail) % steps_per_frame == 0:
+            shoot()
+
+    try:
+        env.reset(seed=seed)
+        observation, _ = env.reset()  # as in a series of trials, where only the first is seeded
+        env.on_simulator_step, over = after_step, False
+        shoot()
+        while not over and len(trail) < limit:
+            observation, _, terminated, truncated, _ = env.step(agent.act(observation, explore))
+            over = terminated or truncated
+            if over and len(trail) % steps_per_frame:
+                shoot()
+            yield from frames
+            frames.clear()
+    finally:
+        renderer.close()
+        env.close()
+
+
+def gif(frames: Iterator[NDArray[np.uint8]], frames_per_second: int = 12) -> bytes:
+    """An animation that TensorBoard shows among its images."""
+    pictures = [Image.fromarray(frame).quantize(64) for frame in frames]
+    buffer = io.BytesIO()
+    pictures[0].save(
+        buffer,
+        format="GIF",
+        save_all=True,
+        append_images=pictures[1:],
+        duration=1000 // frames_per_second,
+        loop=0,
+    )
+    return buffer.getvalue()

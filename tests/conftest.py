@@ -1,0 +1,85 @@
+"""Shared fixtures: runs of a second or less, and what two runs must have in common."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from sofnn_torch import checkpoint
+from sofnn_torch.config import Config, preset
+from sofnn_torch.training import RunOptions
+
+torch.set_num_threads(1)
+
+
+def settings(agent="sga", network="sofnn", pose="estimated", seed=0, trials=4, **parts) -> Config:
+    """Settings of a run that takes a second; parts as in net={"theta": 0.5}."""
+    config = preset(agent, network, "default")
+    parts = {"maze": {}, "net": {}} | parts
+    parts["maze"] = {"max_steps": 120} | parts["maze"]
+    if network == "fixed":
+        parts["net"] = {"grid": (4, 4, 4)} | parts["net"]
+    changes = {name: replace(getattr(config, name), **part) for name, part in parts.items()}
+    return replace(config, pose=pose, seed=seed, trials=trials, **changes)
+
+
+def quick_options(runs: Path, **changes) -> RunOptions:
+    """No pictures, no video, no progress bar, a checkpoint every second trial."""
+    defaults = {"picture_every": 0, "video_every": 0, "quiet": True, "checkpoint_every": 2}
+    return RunOptions(runs=runs, **defaults | changes)
+
+
+@pytest.fixture
+def quick():
+    """Makes settings of short runs."""
+    return settings
+
+
+@pytest.fixture
+def options(tmp_path):
+    """Options of runs under tmp_path / "runs"."""
+    return quick_options(tmp_path / "runs")
+
+
+def equal(a, b) -> bool:
+    """Equal to the last bit, through dictionaries, lists and tensors."""
+    if isinstance(a, dict):
+        return a.keys() == b.keys() and all(equal(a[key], b[key]) for key in a)
+    if isinstance(a, list | tuple):
+        return len(a) == len(b) and all(map(equal, a, b))
+    if isinstance(a, torch.Tensor):
+        return a.dtype == b.dtype and torch.equal(a, b)
+    return a == b
+
+
+def scalars(run: Path) -> dict[str, list[tuple[int, float]]]:
+    """All TensorBoard curves of a run but those of the clock: (trial, value)."""
+    events = EventAccumulator(str(run), size_guidance={"scalars": 0})
+    events.Reload()
+    names = [name for name in events.Tags()["scalars"] if not name.startswith("speed/")]
+    return {name: [(e.step, e.value) for e in events.Scalars(name)] for name in names}
+
+
+def assert_same_run(ours: Path, theirs: Path) -> None:
+    """Two runs have equal states, tables and curves; nothing is missing or doubled."""
+    (last, state, problems), (other, expected, _) = map(checkpoint.find_latest, (ours, theirs))
+    assert last.name == other.name and not problems
+    for part in expected:
+        assert equal(state[part], expected[part]), f"{part} differs"
+    assert (ours / "best.pt").exists() == (theirs / "best.pt").exists()
+    if (ours / "best.pt").exists():
+        a, b = (checkpoint.load(run / "best.pt") for run in (ours, theirs))
+        assert equal(a, b), "best.pt differs"
+    assert (ours / "trials.csv").read_bytes() == (theirs / "trials.csv").read_bytes()
+    curves = scalars(ours)
+    assert curves == scalars(theirs)
+    for name, points in curves.items():
+        assert [step for step, _ in points] == [*range(1, state["trial"] + 1)], name
+
+
+@pytest.fixture
+def same_run():
+    """Asserts that two run directories hold the same run."""
+    return assert_same_run

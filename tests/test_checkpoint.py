@@ -1,0 +1,325 @@
+"""Checkpoint files: whole or not there, and every damage is noticed."""
+
+import io
+import os
+import random
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+from conftest import equal, quick_options, settings
+from hypothesis import given
+from hypothesis import settings as trials_of
+from hypothesis import strategies as st
+
+from sofnn_torch import checkpoint, training
+from sofnn_torch.checkpoint import CheckpointError
+from sofnn_torch.config import make_agent, make_env
+from sofnn_torch.runs import Run
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A finished run with checkpoints 0, 2 and 4."""
+    return training.train(settings(), quick_options(tmp_path_factory.mktemp("runs")))
+
+
+@pytest.fixture
+def copied(run, tmp_path):
+    """A copy of the run that may be harmed."""
+    return Path(shutil.copytree(run, tmp_path / "run"))
+
+
+@pytest.fixture(scope="module")
+def state(run):
+    return checkpoint.find_latest(run)[1]
+
+
+def contents(directory):
+    return {path.name: path.read_bytes() for path in directory.iterdir()}
+
+
+def rewrite(path, state, version=checkpoint.VERSION):
+    """A file with a right checksum around any content."""
+    buffer = io.BytesIO()
+    torch.save(state, buffer)
+    payload = buffer.getvalue()
+    head = b"sofnn-torch checkpoint %d %s\n" % (version, checkpoint._digest(version, payload))
+    path.write_bytes(head + payload)
+
+
+def refused(path):
+    """The one line with which a file is refused."""
+    with pytest.raises(CheckpointError) as caught:
+        state = checkpoint.load(path)
+        config = settings()
+        checkpoint.restore(path, state, make_agent(config), make_env(config))
+    message = str(caught.value)
+    assert message.startswith(str(path)) and "\n" not in message and len(message) < 500
+    return message
+
+
+def test_a_state_comes_back_to_the_last_bit(state, tmp_path):
+    checkpoint.save(tmp_path / "copy.pt", state)
+    assert equal(checkpoint.load(tmp_path / "copy.pt"), state)
+
+
+def test_a_restored_agent_and_maze_go_on_alike(state, run):
+    config = settings()
+    ends = []
+    for _ in range(2):
+        agent, env = make_agent(config), make_env(config)
+        checkpoint.restore(run, state, agent, env)
+        record, path = training.play(env, agent)
+        ends.append((record, path.true.tolist(), checkpoint.snapshot(agent, env)))
+    assert equal(ends[0], ends[1])
+    assert not equal(ends[0][2]["agent"], state["agent"])
+
+
+def test_a_snapshot_does_not_change_with_the_agent():
+    agent, env = make_agent(settings()), make_env(settings())
+    env.reset(seed=0)
+    first = checkpoint.snapshot(agent, env)
+    before = checkpoint.snapshot(agent, env)
+    training.play(env, agent)
+    assert equal(first, before)
+
+
+def test_the_schema_of_the_document_is_that_of_the_file(state):
+    document = (Path(__file__).parents[1] / "docs" / "checkpoints.md").read_text()
+    described = {line.split("`")[1] for line in document.splitlines() if line.startswith("| `")}
+    assert set(state) <= described
+    assert set(state["network"]) <= described
+
+
+def test_the_newest_are_kept(run):
+    assert [path.name for path in checkpoint.checkpoints(run)] == [
+        f"checkpoint-{trial}.pt" for trial in (4, 2, 0)
+    ]
+
+
+# ------------------------------------------------------------------------------------- damage
+
+
+def test_every_bit_of_the_header_counts(run, tmp_path):
+    data = (run / "checkpoint-4.pt").read_bytes()
+    broken = tmp_path / "broken.pt"
+    for bit in range(8 * (data.index(b"\n") + 1)):
+        changed = bytearray(data)
+        changed[bit // 8] ^= 1 << bit % 8
+        broken.write_bytes(changed)
+        with pytest.raises(CheckpointError):
+            checkpoint.load(broken)
+
+
+def damage(data, dice):
+    """The data with a bit flipped, cut off, doubled, mixed up or overwritten somewhere."""
+    at, length = dice.randrange(len(data)), dice.randint(1, 300)
+    kind = dice.randrange(6)
+    if kind < 2:
+        changed = bytearray(data)
+        changed[at] ^= 1 << dice.randrange(8)
+        return bytes(changed)
+    return {
+        2: data[:at],
+        3: data[:at] + data[at + length :],
+        4: data[:at] + dice.randbytes(length) + data[at + length :],
+        5: data + dice.randbytes(length),
+    }[kind]
+
+
+def test_six_hundred_damaged_files_are_refused(run, tmp_path):
+    data, dice = (run / "checkpoint-4.pt").read_bytes(), random.Random(0)
+    broken = tmp_path / "broken.pt"
+    for _ in range(600):
+        broken.write_bytes(damage(data, dice))
+        assert broken.read_bytes() != data
+        with pytest.raises(CheckpointError, match=r"damaged|not a checkpoint"):
+            checkpoint.load(broken)
+
+
+@pytest.mark.parametrize(
+    "data",
+    [b"", b"\x80\x04N.", b"PK\x03\x04" + bytes(100), b"sofnn-torch checkpoint\n", os.urandom(9999)],
+    ids=["empty", "pickle", "zip", "header without numbers", "noise"],
+)
+def test_foreign_files_are_refused(data, tmp_path):
+    (tmp_path / "foreign.pt").write_bytes(data)
+    assert "not a checkpoint of sofnn-torch" in refused(tmp_path / "foreign.pt")
+
+
+def test_a_file_of_torch_is_refused(tmp_path):
+    torch.save({"model": torch.zeros(3)}, tmp_path / "model.pt")
+    assert "not a checkpoint of sofnn-torch" in refused(tmp_path / "model.pt")
+
+
+def test_a_newer_format_is_refused(state, tmp_path):
+    rewrite(tmp_path / "new.pt", state, version=checkpoint.VERSION + 1)
+    assert "update sofnn-torch" in refused(tmp_path / "new.pt")
+
+
+def test_a_missing_file_and_a_directory_are_refused(tmp_path):
+    assert "cannot be read" in refused(tmp_path / "none.pt")
+    assert "cannot be read" in refused(tmp_path)
+
+
+class Exploit:
+    """A pickle that would run code when loaded."""
+
+    def __reduce__(self):
+        return os.system, ("touch exploited",)
+
+
+def test_loading_cannot_run_code(tmp_path, monkeypatch, state):
+    monkeypatch.chdir(tmp_path)
+    rewrite(tmp_path / "evil.pt", state | {"trial": Exploit()})
+    assert "not a checkpoint" in refused(tmp_path / "evil.pt")
+    assert not (tmp_path / "exploited").exists()
+
+
+@pytest.mark.parametrize("key", checkpoint.KINDS)
+def test_a_state_without_a_part_is_refused(key, state, tmp_path):
+    rewrite(tmp_path / "part.pt", {name: part for name, part in state.items() if name != key})
+    assert key in refused(tmp_path / "part.pt")
+
+
+def edits(state):
+    """States with one leaf of agent, environment or network missing or replaced by nonsense."""
+
+    def walk(tree, place=()):
+        for key, part in tree.items():
+            if isinstance(part, dict):
+                yield from walk(part, (*place, key))
+            yield (*place, key)
+
+    places = [p for p in walk(state) if p[0] in ("agent", "env", "network") and len(p) > 1]
+    return [(place, value) for place in places for value in ("missing", None, [1, 2], {"a": "b"})]
+
+
+def edited(tree, place, value):
+    copy = dict(tree)
+    if len(place) > 1:
+        copy[place[0]] = edited(tree[place[0]], place[1:], value)
+    elif value == "missing":
+        del copy[place[0]]
+    else:
+        copy[place[0]] = value
+    return copy
+
+
+def test_wrong_parts_inside_a_state_are_refused(state, tmp_path):
+    accepted = []
+    for place, value in edits(state):
+        rewrite(tmp_path / "edited.pt", edited(state, place, value))
+        try:
+            refused(tmp_path / "edited.pt")
+        except pytest.fail.Exception:
+            accepted.append((place, value))
+    assert not accepted
+
+
+@pytest.mark.parametrize("rows,columns", [(-1, 0), (1, 0), (0, -1), (0, 1)])
+def test_wrong_shapes_are_refused(rows, columns, state, tmp_path):
+    net = dict(state["agent"]["net"])
+    for name in ("blocks.0", "traces_store"):
+        a, b = net[name].shape
+        net[name] = torch.zeros(a + rows, b + columns)
+        rewrite(tmp_path / "shape.pt", edited(state, ("agent", "net"), net))
+        assert "does not fit its settings" in refused(tmp_path / "shape.pt")
+
+
+@pytest.mark.parametrize("rules", [-1, 10**6])
+def test_an_impossible_rule_count_is_refused(rules, state, tmp_path):
+    place = ("agent", "net", "_extra_state", "n_rules")
+    rewrite(tmp_path / "rules.pt", edited(state, place, rules))
+    assert "does not fit its settings" in refused(tmp_path / "rules.pt")
+
+
+# ------------------------------------------------------------------- what a run makes of damage
+
+
+def break_file(path):
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+
+
+def test_the_last_good_checkpoint_is_offered_and_nothing_touched(copied, options):
+    break_file(copied / "checkpoint-4.pt")
+    before = contents(copied)
+    with pytest.raises(CheckpointError, match=r"damaged.*--resume \S*checkpoint-2\.pt"):
+        training.resume(copied, options, trials=6)
+    assert contents(copied) == before
+
+
+def test_the_offer_can_be_taken_and_leads_to_the_same_end(copied, run, options, same_run):
+    break_file(copied / "checkpoint-4.pt")
+    damaged = (copied / "checkpoint-4.pt").read_bytes()
+    training.resume(copied / "checkpoint-2.pt", options)
+    same_run(copied, run)
+    assert (copied / "checkpoint-4.pt.unused").read_bytes() == damaged
+    assert (copied / "trials.csv.unused").exists()
+
+
+def test_without_a_good_checkpoint_nothing_is_touched(copied, options):
+    for path in checkpoint.checkpoints(copied):
+        break_file(path)
+    before = contents(copied)
+    with pytest.raises(CheckpointError, match="no checkpoint to go on from"):
+        training.resume(copied, options, trials=6)
+    assert contents(copied) == before
+
+
+def test_a_checkpoint_of_other_settings_is_refused(copied, options, tmp_path):
+    other = training.train(settings(net={"theta": 0.5}), quick_options(tmp_path / "other"))
+    shutil.copy(other / "checkpoint-4.pt", copied / "checkpoint-6.pt")
+    before = contents(copied)
+    with pytest.raises(CheckpointError, match=r"other settings \(net\.theta 0\.5, here"):
+        training.resume(copied, options, trials=9)
+    assert contents(copied) == before
+
+
+def test_a_lone_checkpoint_goes_on_in_a_new_run(run, options, tmp_path):
+    lone = tmp_path / "lone.pt"
+    shutil.copy(run / "checkpoint-2.pt", lone)
+    goes_on = training.resume(lone, options)
+    ours, theirs = (checkpoint.find_latest(path)[1] for path in (goes_on, run))
+    assert equal(ours, theirs)
+
+
+# --------------------------------------------------------------------------- writing and reading
+
+
+@pytest.mark.parametrize("failing", ["fsync", "replace"])
+def test_a_failed_write_leaves_the_old_file(failing, state, tmp_path, monkeypatch):
+    path = tmp_path / "checkpoint-1.pt"
+    checkpoint.save(path, state)
+    before = contents(tmp_path)
+
+    def fail(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, failing, fail)
+    with pytest.raises(OSError, match="No space left"):
+        checkpoint.save(path, state | {"trial": 99})
+    assert contents(tmp_path) == before
+
+
+@trials_of(max_examples=100, deadline=None)
+@given(st.binary(max_size=400))
+def test_any_trial_table_is_cut_or_refused_in_one_line(data):
+    """A torn, foreign or empty trials.csv never ends a resume with a traceback."""
+    import tempfile
+
+    with tempfile.TemporaryDirectory() as place:
+        directory = Path(place)
+        config = settings()
+        run = Run.create(directory, "run", config, keep=3)
+        (run.path / "trials.csv").write_bytes(data)
+        try:
+            run.rewind(2)
+        except ValueError as error:
+            assert "\n" not in str(error)
+        finally:
+            run.close()

@@ -1,0 +1,384 @@
+"""The command line: what a newcomer sees, and one line for whatever is wrong."""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import asdict
+from pathlib import Path
+
+import pytest
+from conftest import quick_options
+from conftest import settings as short
+from hypothesis import HealthCheck, example, given, settings
+from hypothesis import strategies as st
+
+from sofnn_torch import checkpoint, cli, seeds, training
+from sofnn_torch.cli import main, parse
+from sofnn_torch.config import Config, from_dict, make_agent, preset
+from sofnn_torch.runs import load_config
+
+ROOT = Path(__file__).parents[1]
+QUICK = "--quiet --picture-every 0 --video-every 0 --maze.max-steps 100".split()
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    """An empty working directory."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def run(here):
+    """A run of two trials."""
+    assert main(["--trials", "2", *QUICK]) == 0
+    return Path("runs/sga-sofnn-estimated-s0")
+
+
+def contents(directory):
+    files = (path for path in Path(directory).rglob("*") if path.is_file())
+    return {path: path.read_bytes() for path in files}
+
+
+def bad(arguments, capsys):
+    """The line with which arguments are refused."""
+    capsys.readouterr()
+    assert main(arguments) == 2
+    out, err = capsys.readouterr()
+    (line,) = err.splitlines()
+    assert line.startswith("error: ") and not out
+    return line
+
+
+# ------------------------------------------------------------------------------------- good input
+
+
+def test_the_help_begins_with_examples_and_shows_every_setting(capsys):
+    with pytest.raises(SystemExit) as stop:
+        parse(["--help"])
+    assert stop.value.code == 0
+    text = capsys.readouterr().out
+    assert text.index("train.py --resume") < text.index("--agent {sga,q}")
+    names = [name for name, part in asdict(Config()).items() if not isinstance(part, dict)]
+    nested = asdict(Config()).items()
+    names += [
+        f"{part}.{name}" for part, fields in nested if isinstance(fields, dict) for name in fields
+    ]
+    for name in names:
+        assert f"--{name}".replace("_", "-") in text
+
+
+def test_the_help_shows_the_values_of_the_chosen_preset(capsys):
+    with pytest.raises(SystemExit):
+        parse(["--preset", "paper", "--agent", "q", "--help"])
+    text = re.sub(r"[│\s]+", " ", capsys.readouterr().out)
+    rate = preset("q", "sofnn", "paper").q.trace_decay
+    assert f"Lambda of the eligibility traces; 0 in the paper. (default: {rate})" in text
+
+
+@pytest.mark.parametrize("agent", ["sga", "q"])
+@pytest.mark.parametrize("network", ["sofnn", "fixed"])
+@pytest.mark.parametrize("name", ["default", "paper"])
+def test_flags_lie_on_top_of_the_preset(agent, network, name):
+    words = f"--preset {name} --network={network} --agent {agent} --net.theta 0.25".split()
+    config = parse(words).config
+    expected = asdict(preset(agent, network, name))
+    expected["net"]["theta"] = 0.25
+    assert asdict(config) == expected
+
+
+def test_a_run_from_the_command_line(run):
+    assert load_config(run).maze.max_steps == 100
+    assert checkpoint.find_latest(run)[1]["trial"] == 2
+
+
+def test_resume_with_more_trials(run):
+    assert main(["--resume", str(run), "--trials", "3", *QUICK]) == 0
+    assert checkpoint.find_latest(run)[1]["trial"] == 3
+
+
+def test_flags_that_agree_with_the_run_are_fine(run):
+    theta = str(load_config(run).net.theta)
+    assert main(["--resume", str(run), "--trials", "3", "--net.theta", theta, *QUICK]) == 0
+
+
+def test_train_py_is_the_same_program(here):
+    command = [sys.executable, str(ROOT / "train.py"), "--trials", "1", *QUICK]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0 and "done" in done.stdout
+    refused = subprocess.run([*command, "--tirals", "1"], capture_output=True, text=True)
+    assert refused.returncode == 2
+    assert len(refused.stderr.splitlines()) == 1 and "Traceback" not in refused.stderr
+
+
+def test_interruption_says_how_to_go_on(here, monkeypatch, capsys):
+    real = training.play
+
+    def interrupted(*arguments, **keywords):
+        os.kill(os.getpid(), signal.SIGINT)
+        return real(*arguments, **keywords)
+
+    monkeypatch.setattr(training, "play", interrupted)
+    assert main(["--trials", "2", *QUICK]) == 130
+    assert "--resume runs/sga-sofnn-estimated-s0" in capsys.readouterr().out
+
+
+def test_divergence_is_one_line_and_exit_code_1(here, capsys):
+    assert main(["--agent", "q", "--q.rate-action", "1e3", *QUICK]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("error: trial 1 diverged: ")
+    (file,) = Path("runs").rglob("divergence-1.pt")
+    assert main(["--replay", str(file)]) == 1
+
+
+# -------------------------------------------------------------------------------------- bad input
+
+
+@pytest.mark.parametrize(
+    "words,message",
+    [
+        ("--net.tetha 0.5", "did you mean --net.theta?"),
+        ("--tirals 5", "did you mean --trials?"),
+        ("--reusme x", "did you mean --resume?"),
+        ("--sga.rate-men 1", "did you mean --sga.rate-mean?"),
+        ("extra", "extra"),
+        ("--agent dqn", "dqn"),
+        ("--network lstm", "--network must be sofnn or fixed"),
+        ("--preset best", "best"),
+        ("--pose gps", "gps"),
+        ("--trials", "--trials"),
+        ("--trials many", "--trials"),
+        ("--trials -3", "--trials must be positive, got -3"),
+        ("--trials 0", "--trials must be positive"),
+        ("--seed -1", "--seed must not be negative"),
+        ("--net.theta 0", "--net.theta must lie between 0 and 1"),
+        ("--net.theta 1", "--net.theta must lie between 0 and 1"),
+        ("--net.theta nan", "--net.theta must be a finite number"),
+        ("--net.theta inf", "--net.theta must be a finite number"),
+        ("--net.width-position 0", "--net.width-position must be positive"),
+        ("--net.width-heading -1", "--net.width-heading must be positive"),
+        ("--net.width-position 1e-6", "width"),
+        ("--net.max-rules 0", "--net.max-rules must be positive"),
+        ("--net.grid 4 4", "--net.grid"),
+        ("--network fixed --net.grid 999 999 999", "--net.max-rules"),
+        ("--sga.gamma 1.5", "--sga.gamma must lie in"),
+        ("--sga.rate-mean -1", "--sga.rate-mean must not be negative"),
+        ("--sga.rate-mean nan", "--sga.rate-mean must be a finite number"),
+        ("--agent q --q.temperature 0", "--q.temperature must be positive"),
+        ("--agent q --q.segments 1000000000", "--q.segments must be at most"),
+        ("--agent q --sga.gamma 0.5", "--sga.gamma has no effect with --agent q"),
+        ("--q.gamma 0.5", "--q.gamma has no effect with --agent sga"),
+        ("--maze.hold 0", "--maze.hold must be positive"),
+        ("--maze.hold 10000000000", "--maze.hold must be at most"),
+        ("--maze.motor-noise 1", "--maze.motor-noise must lie in"),
+        ("--keep 0", "--keep must be at least 1"),
+        ("--checkpoint-every 0", "--checkpoint-every must be at least 1"),
+        ("--threads 0", "--threads must be at least 1"),
+        ("--name a/b", "--name must be a plain directory name"),
+        ("--seeds 3-1", "--seeds must be a list"),
+        ("--seeds 1,x", "--seeds must be a list"),
+        ("--seeds 1,1", "--seeds must be a list"),
+        ("--seeds 0-3 --workers 0", "--workers must be at least 1"),
+        ("--resume nowhere", "not a run directory"),
+        ("--replay nowhere", "cannot be read"),
+        ("--runs /dev/null", "cannot be used"),
+        ("--trials " + "9" * 400, "--trials must be a finite number"),
+    ],
+)
+def test_bad_flags_get_one_clear_line_and_leave_nothing(words, message, here, capsys):
+    assert message in bad(words.split(), capsys)
+    assert not contents(here)
+
+
+@pytest.mark.parametrize(
+    "words,message",
+    [
+        ("--net.theta 0.77", "--net.theta 0.77 contradicts"),
+        ("--seed 5", "--seed 5 contradicts"),
+        ("--agent q", "--agent q contradicts"),
+        ("--pose true", "--pose true contradicts"),
+        ("--trials 1", "has 2 trials already"),
+        ("--name other", "--name is for new runs"),
+        ("--seeds 0-3", "--resume goes with neither"),
+        ("--replay x", "--resume goes with neither"),
+    ],
+)
+def test_a_resumed_run_keeps_its_settings(words, message, run, capsys):
+    before = contents(run)
+    assert message in bad(["--resume", str(run), *words.split()], capsys)
+    assert contents(run) == before
+
+
+@pytest.mark.parametrize("data", [b"", b"{", b"[]", b'{"config": 3}', b"\xff\xfe", b"[" * 100_000])
+def test_unreadable_settings_get_one_clear_line(data, run, capsys):
+    (run / "config.json").write_bytes(data)
+    before = contents(run)
+    assert "config.json" in bad(["--resume", str(run)], capsys)
+    assert contents(run) == before
+
+
+def test_a_directory_that_is_no_run_is_left_alone(here, capsys):
+    Path("documents").mkdir()
+    Path("documents/letter.txt").write_text("dear")
+    before = contents(here)
+    assert "not a run directory" in bad(["--resume", "documents"], capsys)
+    assert contents(here) == before
+
+
+def test_a_damaged_checkpoint_gets_one_clear_line(run, capsys):
+    path = run / "checkpoint-2.pt"
+    path.write_bytes(path.read_bytes()[:-1])
+    before = contents(run)
+    line = bad(["--resume", str(run), "--trials", "3"], capsys)
+    assert "damaged or cut off" in line and "checkpoint-0.pt" in line
+    assert contents(run) == before
+
+
+# ------------------------------------------------------------------------------------ many seeds
+
+
+def test_several_seeds_in_one_call(here, capsys):
+    assert main(["--seeds", "0,2", "--workers", "2", "--trials", "2", *QUICK]) == 0
+    for seed in (0, 2):
+        run = Path(f"runs/sga-sofnn-estimated-s{seed}")
+        assert load_config(run).seed == seed
+        assert checkpoint.find_latest(run)[1]["trial"] == 2
+    assert not Path("runs/sga-sofnn-estimated-s1").exists()
+
+
+def test_a_crash_of_one_seed_leaves_the_others(here, capsys, monkeypatch):
+    """The process of one seed is killed as soon as its run is there."""
+    real = seeds.subprocess.Popen
+
+    def popen(command, **keywords):
+        child = real(command, **keywords)
+        if command[command.index("--seed") + 1] == "1":
+            child.kill()
+        return child
+
+    monkeypatch.setattr(seeds.subprocess, "Popen", popen)
+    assert main(["--seeds", "0-1", "--workers", "1", "--trials", "1", *QUICK]) == 1
+    err = capsys.readouterr().err
+    assert "seed 0: done" in err and "seed 1: exit code -9" in err and "1 of 2" in err
+    assert checkpoint.find_latest(Path("runs/sga-sofnn-estimated-s0"))[1]["trial"] == 1
+
+
+def test_a_signal_stops_all_seeds_after_saving(here):
+    words = ["--seeds", "0-3", "--workers", "1", "--trials", "100000", *QUICK]
+    child = subprocess.Popen(
+        [sys.executable, "-m", "sofnn_torch.cli", *words],
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+    )
+    run = Path("runs/sga-sofnn-estimated-s0")
+    deadline = time.monotonic() + 60
+    while not (run / "trials.csv").exists() and time.monotonic() < deadline:
+        time.sleep(0.1)
+    child.send_signal(signal.SIGTERM)
+    assert child.wait(60) == 128 + signal.SIGTERM
+    state = checkpoint.find_latest(run)[1]
+    assert state["trial"] == len((run / "trials.csv").read_text().splitlines()) - 1 > 0
+    assert [path.name for path in Path("runs").iterdir()] == [run.name]
+
+
+@pytest.mark.parametrize(
+    "text,expected", [("0-3", [0, 1, 2, 3]), ("5", [5]), ("0,3,5-6", [0, 3, 5, 6])]
+)
+def test_lists_of_seeds(text, expected):
+    assert seeds.parse(text) == expected
+
+
+# ------------------------------------------------------------------------------------------- fuzz
+
+plain = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8),
+    lambda parts: (
+        st.lists(parts, max_size=3) | st.dictionaries(st.text(max_size=8), parts, max_size=3)
+    ),
+    max_leaves=5,
+)
+names = sorted(training.runs.flatten(asdict(Config()))) if hasattr(training, "runs") else []
+
+
+def places(tree, place=()):
+    for key, part in tree.items():
+        yield (*place, key)
+        if isinstance(part, dict):
+            yield from places(part, (*place, key))
+
+
+PLACES = sorted(places(asdict(Config())))
+
+
+def with_value(tree, place, value):
+    head, *rest = place
+    return {**tree, head: with_value(tree[head], rest, value) if rest else value}
+
+
+@settings(max_examples=500, deadline=None)
+@given(st.sampled_from(PLACES), plain | st.sampled_from(["sga", "q", "fixed", 0.5, 1, -1, 10**30]))
+@example(("net", "theta"), float("nan"))
+@example(("net", "grid"), [1, 2])
+@example(("q", "trace_limit"), None)
+@example(("seed",), True)
+def test_any_settings_are_valid_or_refused_in_one_line(place, value):
+    data = with_value(asdict(Config()), place, value)
+    try:
+        config = from_dict(data)
+    except ValueError as error:
+        assert "\n" not in str(error) and len(str(error)) < 300
+        return
+    assert from_dict(json.loads(config.to_json())) == config
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.sampled_from(PLACES), st.integers(-3, 3) | st.floats(-10, 10))
+def test_valid_settings_make_an_agent_or_are_refused_in_one_line(place, value):
+    try:
+        make_agent(from_dict(with_value(asdict(Config()), place, value)))
+    except ValueError as error:
+        assert "\n" not in str(error)
+
+
+@settings(max_examples=400, deadline=None)
+@given(st.binary(max_size=60) | plain.map(lambda value: json.dumps({"config": value}).encode()))
+def test_any_config_file_is_refused_in_one_line(data):
+    with tempfile.TemporaryDirectory() as directory:
+        Path(directory, "config.json").write_bytes(data)
+        try:
+            assert isinstance(load_config(Path(directory)), Config)
+        except ValueError as error:
+            assert str(error).startswith(directory) and "\n" not in str(error)
+
+
+words = st.sampled_from(
+    [
+        "--agent",
+        "--net.theta",
+        "--trials",
+        "--seeds",
+        "--q.gamma",
+        "--name",
+        "--net.grid",
+        "--quiet",
+    ]
+    + ["q", "sga", "0.5", "3", "-1", "nan", "None", "--", "--no-quiet", "=", "--net.theta=0.3"]
+) | st.text(st.characters(codec="utf-8", exclude_characters="\x00"), max_size=6)
+
+
+@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(st.lists(words, max_size=4).filter(lambda ws: not {"-h", "--help"} & set(ws)))
+def test_any_arguments_are_parsed_or_refused_in_one_line(arguments):
+    try:
+        assert isinstance(parse(arguments), cli.Flags)
+    except ValueError as error:
+        assert str(error)
+
+
+def test_a_config_survives_its_file(tmp_path):
+    config = short("q", "fixed", q={"trace_limit": None}, net={"grid": (3, 5, 7)}, trials=1)
+    assert load_config(training.train(config, quick_options(tmp_path))) == config

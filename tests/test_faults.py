@@ -1,0 +1,427 @@
+"""Disks that fill up, directories that vanish, numbers that diverge: nothing is lost."""
+
+import builtins
+import dataclasses
+import errno
+import math
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import filelock
+import pytest
+import torch
+from conftest import equal, quick_options, settings
+
+from sofnn_torch import checkpoint, monitoring, training
+from sofnn_torch.checkpoint import CheckpointError
+from sofnn_torch.config import make_agent, make_env
+from sofnn_torch.guard import Divergence, Interrupted
+from sofnn_torch.runs import Run, default_name
+from sofnn_torch.training import play
+
+NAME = default_name(settings())
+
+
+@pytest.fixture
+def reference(tmp_path):
+    """A run of four trials that nothing disturbed."""
+    return training.train(settings(), quick_options(tmp_path / "reference"))
+
+
+@pytest.fixture
+def between_trials(monkeypatch):
+    """Runs a function before the trial of a given number."""
+
+    def plan(**actions):
+        real, trial = training.play, 0
+
+        def scripted(*arguments, **keywords):
+            nonlocal trial
+            trial += 1
+            if action := actions.get(f"before_{trial}"):
+                action()
+            return real(*arguments, **keywords)
+
+        monkeypatch.setattr(training, "play", scripted)
+
+    return plan
+
+
+def same_end(ours, theirs):
+    a, b = (checkpoint.find_latest(run)[1] for run in (ours, theirs))
+    assert equal(a, b)
+    assert (ours / "trials.csv").read_bytes() == (theirs / "trials.csv").read_bytes()
+
+
+def warnings(capsys):
+    return [line for line in capsys.readouterr().err.splitlines() if line.startswith("warning")]
+
+
+# --------------------------------------------------------------------------------- disk and files
+
+
+def mounted(directory, options):
+    """A small file system of its own, or a skip where that is not allowed."""
+    directory.mkdir()
+    command = ["mount", "-t", "tmpfs", "-o", options, "tmpfs", str(directory)]
+    done = subprocess.run(command, capture_output=True, text=True)
+    if done.returncode:
+        pytest.skip(f"no tmpfs can be mounted here: {done.stderr.strip()}")
+    return directory
+
+
+@pytest.fixture
+def small_disk(tmp_path):
+    """A disk of 512 KiB."""
+    if not shutil.which("mount"):
+        pytest.skip("no mount command")
+    disk = mounted(tmp_path / "disk", "size=512k")
+    yield disk
+    subprocess.run(["umount", "-l", str(disk)], check=True)
+
+
+def fill(disk):
+    """Take all the space that is left."""
+    with open(disk / "filler", "wb", buffering=0) as file:
+        try:
+            while True:
+                file.write(bytes(4096))
+        except OSError as error:
+            assert error.errno == errno.ENOSPC
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_a_disk_full_for_a_while_costs_nothing(small_disk, reference, between_trials, capsys):
+    between_trials(
+        before_2=lambda: fill(small_disk), before_4=lambda: (small_disk / "filler").unlink()
+    )
+    run = training.train(settings(), quick_options(small_disk))
+    same_end(run, reference)
+    assert len([line for line in warnings(capsys) if "No space left" in line]) >= 1
+    assert not list(run.glob(".*.tmp"))
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_a_full_disk_keeps_the_old_checkpoint_and_saves_elsewhere(
+    small_disk, reference, between_trials, tmp_path, monkeypatch
+):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    between_trials(before_2=lambda: fill(small_disk))
+    with pytest.raises(OSError, match=r"trial 4 is saved outside it.*--resume \S+checkpoint-4\.pt"):
+        training.train(settings(), quick_options(small_disk))
+    assert checkpoint.find_latest(small_disk / NAME)[1]["trial"] == 0
+    (rescued,) = tmp_path.glob("sofnn-rescue-*/*.pt")
+    assert equal(checkpoint.load(rescued), checkpoint.find_latest(reference)[1])
+
+
+def test_a_disk_that_is_full_from_the_start_is_named(small_disk):
+    fill(small_disk)
+    with pytest.raises(ValueError, match="No space left"):
+        training.train(settings(), quick_options(small_disk))
+    assert [path.name for path in small_disk.iterdir()] == ["filler"]
+
+
+def test_a_read_only_disk_is_named_at_the_start(small_disk):
+    subprocess.run(["mount", "-o", "remount,ro", str(small_disk)], check=True)
+    with pytest.raises(ValueError, match="Read-only file system"):
+        training.train(settings(), quick_options(small_disk))
+
+
+def test_a_disk_that_is_read_only_for_a_while_costs_nothing(
+    options, reference, monkeypatch, capsys
+):
+    # Open files forbid a real remount, so every open for the second trial's record is refused.
+    real, calls = Run.record, 0
+
+    def refuse(*_, **__):
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    def record(run, row):
+        nonlocal calls
+        calls += 1
+        with pytest.MonkeyPatch.context() as patch:
+            if calls == 2:
+                patch.setattr(builtins, "open", refuse)
+            real(run, row)
+
+    monkeypatch.setattr(Run, "record", record)
+    same_end(training.train(settings(), options), reference)
+    (line,) = warnings(capsys)
+    assert "Read-only file system" in line
+
+
+@pytest.mark.parametrize("when", ["before_1", "before_3", "before_4"])
+def test_a_deleted_directory_is_made_anew(when, options, reference, between_trials, capsys):
+    run = options.runs / NAME
+    between_trials(**{when: lambda: shutil.rmtree(run)})
+    assert training.train(settings(), options) == run
+    same_end(run, reference)
+    assert (run / "config.json").read_bytes() == (reference / "config.json").read_bytes()
+    (line,) = warnings(capsys)
+    assert "was deleted" in line
+
+
+def test_all_runs_deleted_are_made_anew(options, reference, between_trials):
+    between_trials(before_3=lambda: shutil.rmtree(options.runs))
+    same_end(training.train(settings(), options), reference)
+
+
+def test_a_later_run_of_the_same_name_is_not_touched(options, reference, between_trials):
+    run = options.runs / NAME
+
+    def replace():
+        shutil.rmtree(run)
+        shutil.copytree(reference, run)
+
+    between_trials(before_3=replace)
+    elsewhere = training.train(settings(), options)
+    assert elsewhere.name == f"{NAME}-2"
+    same_end(elsewhere, reference)
+    for path in reference.glob("*.pt"):
+        assert (run / path.name).read_bytes() == path.read_bytes()
+
+
+def test_a_damaged_table_is_written_anew(options, reference, between_trials):
+    table = options.runs / NAME / "trials.csv"
+    between_trials(before_3=lambda: table.write_text("gone"))
+    same_end(training.train(settings(), options), reference)
+
+
+def test_a_second_process_is_refused(options):
+    run = training.train(settings(trials=2), options)
+    before = {path.name: path.read_bytes() for path in run.iterdir()}
+    with filelock.FileLock(run / "run.lock"):  # as the first process holds it
+        with pytest.raises(ValueError, match="another process works on it"):
+            training.resume(run, options, trials=4)
+        assert {path.name: path.read_bytes() for path in run.iterdir()} == before
+    assert training.resume(run, options, trials=4) == run
+
+
+def test_a_failed_resume_gives_the_run_back(options):
+    run = training.train(settings(trials=2), options)
+    (run / "checkpoint-2.pt").write_bytes(b"")
+    with pytest.raises(CheckpointError):
+        training.resume(run, options)
+    with filelock.FileLock(run / "run.lock", timeout=0):
+        pass
+
+
+# ---------------------------------------------------------------------------------------- signals
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_between_trials_saves_what_is_done(number, options, between_trials):
+    between_trials(before_4=lambda: os.kill(os.getpid(), number))
+    handlers = [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)]
+    with pytest.raises(Interrupted) as caught:
+        training.train(settings(), quick_options(options.runs, checkpoint_every=100))
+    assert caught.value.number == number and caught.value.run == options.runs / NAME
+    assert checkpoint.find_latest(options.runs / NAME)[1]["trial"] == 3
+    assert [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)] == handlers
+
+
+def test_a_bug_in_a_trial_saves_what_is_done(options, reference, between_trials):
+    def fail():
+        raise RuntimeError("a bug")
+
+    between_trials(before_4=fail)
+    with pytest.raises(RuntimeError, match="a bug"):
+        training.train(settings(), quick_options(options.runs, checkpoint_every=100))
+    training.resume(options.runs / NAME, options)
+    same_end(options.runs / NAME, reference)
+
+
+# ------------------------------------------------------------------------------------- monitoring
+
+
+def test_training_goes_on_without_tensorboard(options, reference, monkeypatch, capsys):
+    def refuse(*_, **__):
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    monkeypatch.setattr(monitoring, "SummaryWriter", refuse)
+    run = training.train(settings(), options)
+    same_end(run, reference)
+    (line,) = warnings(capsys)
+    assert "TensorBoard" in line and "Permission denied" in line
+
+
+def test_training_goes_on_without_gl(options, reference, monkeypatch, capsys):
+    def refuse(*_, **__):
+        raise RuntimeError("no GL context")
+
+    monkeypatch.setattr(monitoring, "film", refuse)
+    run = training.train(settings(), dataclasses.replace(options, video_every=1))
+    same_end(run, reference)
+    (line,) = warnings(capsys)
+    assert "video" in line and "no GL context" in line
+
+
+# ---------------------------------------------------------------------------------------- numbers
+
+
+def parts(config):
+    agent, env = make_agent(config), make_env(config)
+    env.reset(seed=0)
+    play(env, agent)
+    return agent, env
+
+
+def poisoned(env, decision, change):
+    """The environment, whose result at a decision is changed."""
+    real, count = env.step, 0
+
+    def step(action):
+        nonlocal count
+        count += 1
+        result = real(action)
+        return change(*result) if count == decision else result
+
+    env.step = step
+    return env
+
+
+@pytest.mark.parametrize("agent", ["sga", "q"])
+@pytest.mark.parametrize("part", ["centres", "widths", "consequents"])
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_parameters_that_are_not_finite_are_named(agent, part, value):
+    learner, env = parts(settings(agent))
+    getattr(learner.net, part)[0, 0] = value
+    with pytest.raises(Divergence, match=f"{part} of .* rules"):
+        play(env, learner)
+
+
+@pytest.mark.parametrize("agent", ["sga", "q"])
+def test_traces_that_are_not_finite_are_named(agent):
+    learner, env = parts(settings(agent))
+
+    def change(*result):
+        learner.net.traces[-1, 0] = math.nan
+        return result
+
+    with pytest.raises(Divergence, match=r"(traces|consequents) of .* rules"):
+        play(poisoned(env, 3, change), learner)
+
+
+@pytest.mark.parametrize("agent", ["sga", "q"])
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_an_observation_that_is_not_finite_is_named(agent, value):
+    learner, env = parts(settings(agent))
+
+    def change(observation, *rest):
+        observation[1] = value
+        return observation, *rest
+
+    with pytest.raises(Divergence, match="observation"):
+        play(poisoned(env, 3, change), learner)
+
+
+@pytest.mark.parametrize("agent", ["sga", "q"])
+def test_a_reward_that_is_not_finite_is_noticed(agent):
+    learner, env = parts(settings(agent))
+
+    def change(observation, _, *rest):
+        return observation, math.nan, *rest
+
+    with pytest.raises(Divergence):
+        play(poisoned(env, 3, change), learner)
+
+
+def test_unstable_physics_is_named():
+    learner, env = parts(settings())
+
+    def change(*result):
+        env.unwrapped.physics.data.qvel[:] = 1e12
+        return result
+
+    with pytest.raises(Divergence, match=r"MuJoCo warns of BADQ|observation"):
+        play(poisoned(env, 3, change), learner)
+
+
+def test_other_errors_stay_what_they_are():
+    learner, env = parts(settings())
+
+    def change(*_):
+        raise ValueError("a bug")
+
+    with pytest.raises(ValueError, match="a bug"):
+        play(poisoned(env, 3, change), learner)
+
+
+def test_a_divergence_can_be_played_again(options):
+    config = settings("q", q={"rate_action": 1e3}, maze={"max_steps": 1000})
+    with pytest.raises(Divergence, match=r"trial \d+ diverged: .*divergence-\d+\.pt") as first:
+        training.train(config, options)
+    run = options.runs / default_name(config)
+    (file,) = run.glob("divergence-*.pt")
+    assert f"trial {checkpoint.load(file)['trial'] + 1} diverged" in str(first.value)
+    with pytest.raises(Divergence) as second:
+        training.replay(file)
+    assert checkpoint.load(file)["reason"] == str(second.value)
+    assert str(second.value) in str(first.value)
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        settings("q", q={"rate_action": 1e3}),
+        settings("q", q={"rate_state": 1e3}),
+        settings("q", q={"rate_constant": 1e3}),
+        settings("q", q={"rate_centre": 1e3}),
+        settings(sga={"rate_value": 1e3}),
+        settings(sga={"rate_centre": 1e30}),
+        settings(sga={"rate_mean": 1e250}),
+    ],
+    ids=lambda config: config.agent,
+)
+def test_extreme_rates_end_in_a_message(config, options):
+    config = dataclasses.replace(
+        config, trials=20, maze=dataclasses.replace(config.maze, max_steps=2000)
+    )
+    with pytest.raises(Divergence, match="diverged"):
+        training.train(config, options)
+
+
+@pytest.mark.parametrize("agent", ["sga", "q"])
+@pytest.mark.parametrize(
+    "net", [{"theta": 0.999}, {"width_position": 1e-3}, {"width_heading": 1e-3}]
+)
+def test_extreme_growth_ends_at_the_cap(agent, net, options, capsys):
+    config = settings(agent, net=net | {"max_rules": 20}, maze={"max_steps": 500})
+    run = training.train(config, options)
+    state = checkpoint.find_latest(run)[1]
+    assert state["network"]["rules"] == 20
+    (line,) = warnings(capsys)
+    assert "20 rules" in line and "--net.max-rules" in line
+    table = torch.cat([v for k, v in state["agent"]["net"].items() if "blocks" in k], 1)
+    assert table[:, :20].isfinite().all()
+
+
+@pytest.mark.parametrize("name", ["width_position", "width_heading"])
+@pytest.mark.parametrize("width", [1e-6, 0.0, -1.0, math.nan, 1e-300])
+def test_impossible_widths_are_refused(name, width, options):
+    with pytest.raises(ValueError, match="width"):
+        training.train(settings(net={name: width}), options)
+    assert not options.runs.exists()
+
+
+def test_no_gl_at_all_is_one_warning(tmp_path):
+    """A process whose GL library cannot be loaded trains and records without video."""
+    command = [sys.executable, "train.py", "--runs", str(tmp_path), "--trials", "2", "--quiet"]
+    command += ["--video-every", "1", "--picture-every", "0", "--maze.max-steps", "50"]
+    # An X display that is not there: GLFW loads and fails.
+    environment = os.environ | {"MUJOCO_GL": "glfw", "DISPLAY": ":987", "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(
+        command,
+        env=environment,
+        capture_output=True,
+        text=True,
+        cwd=Path(__file__).parents[1],
+        timeout=120,
+    )
+    assert done.returncode == 0, done.stderr
+    assert sum("no video" in line for line in done.stderr.splitlines()) == 1, done.stderr
+    assert checkpoint.find_latest(tmp_path / NAME)[1]["trial"] == 2

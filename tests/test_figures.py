@@ -1,0 +1,168 @@
+"""Pictures show what they claim; surveys agree with the learner that they ask."""
+
+import io
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from matplotlib.patches import Rectangle
+from PIL import Image
+
+from sofnn_torch import figures
+from sofnn_torch.config import make_agent, make_env, preset
+from sofnn_torch.monitoring import Trajectory
+from sofnn_torch.survey import survey, usage
+
+RNG = np.random.default_rng(7)
+STATES = np.column_stack([RNG.uniform(0, 1, (60, 2)), RNG.uniform(-math.pi, math.pi, 60)])
+
+
+@pytest.fixture(scope="module")
+def plan():
+    env = make_env(preset("sga", "sofnn", "default"))
+    yield env.unwrapped.plan
+    env.close()
+
+
+@pytest.fixture
+def axes():
+    return figures.canvas()[1][0]
+
+
+def learner(kind, **settings):
+    """A learner with rules at STATES and random consequents."""
+    config = preset(kind, "sofnn", "default")
+    config = replace(config, **{kind: replace(getattr(config, kind), **settings)})
+    agent = make_agent(config)
+    inputs, outputs = agent.net.n_inputs, agent.net.n_outputs
+    rng = np.random.default_rng(3)
+    for state in STATES:
+        centre = [*state, rng.uniform(-1, 1)][:inputs]
+        consequents = rng.uniform(-1, 1, outputs)
+        if kind == "sga":
+            consequents[agent.m : 2 * agent.m] = 0.1
+        agent.net.add_rule(
+            torch.tensor(centre).float(), consequents=torch.tensor(consequents).float()
+        )
+    return agent
+
+
+@pytest.mark.parametrize("coding", ["onehot", "wheels", "scalar", "antecedent"])
+def test_survey_of_q_agrees_with_the_greedy_action(coding):
+    agent = learner("q", coding=coding)
+    turns = [agent.act(state.astype(np.float32)) - 1 for state in STATES]
+    answer = survey(agent, STATES.astype(np.float32))
+    assert answer.turn.tolist() == turns
+    assert answer.forward.tolist() == [1 - abs(turn) for turn in turns]
+    state = torch.tensor(STATES[0]).float()
+    firing = agent.net.normalised_firing(agent._inputs(state))
+    assert answer.value[0] == pytest.approx(agent.action_values(state, firing).max().item(), 1e-4)
+
+
+@pytest.mark.parametrize("actions", ["three", "steer", "wheels"])
+def test_survey_of_sga_agrees_with_the_mean_action(actions):
+    agent = learner("sga", actions=actions)
+    answer = survey(agent, STATES.astype(np.float32))
+    for i, state in enumerate(STATES.astype(np.float32)):
+        action = agent.act(state)
+        if actions == "three":
+            expected = float(action == 1), action - 1
+        elif actions == "steer":
+            expected = 1 - abs(action[0]), action[0]
+        else:  # the fastest turn, wheels at -0.4 and 0.4, counts as 1
+            expected = action.mean(), np.clip((action[1] - action[0]) / 0.8, -1, 1)
+        assert (answer.forward[i], answer.turn[i]) == pytest.approx(expected, abs=1e-5)
+    assert answer.value == pytest.approx(agent.net(torch.tensor(STATES).float())[:, -1].detach())
+
+
+def test_a_learner_without_values_has_no_value_field(plan, axes):
+    agent = learner("sga", baseline="constant")
+    assert survey(agent, STATES).value is None
+    with pytest.raises(ValueError, match="baseline"):
+        figures.value_field(plan, agent, axes)
+
+
+@pytest.mark.parametrize("coding", ["onehot", "antecedent"])
+def test_usage_is_a_share(coding):
+    agent = learner("q", coding=coding)
+    share = usage(agent, STATES[:5])
+    assert share.shape == (60,)
+    assert share.sum() == pytest.approx(1, abs=1e-5)
+    if coding == "onehot":
+        assert set(np.argsort(share)[-5:]) == set(range(5))  # the rules at these very states
+
+
+def test_the_plan_shows_every_wall_inside_the_axes(plan, axes):
+    figures.maze_plan(plan, axes)
+    boxes = [patch for patch in axes.patches if isinstance(patch, Rectangle)]
+    assert len(boxes) == len(plan.walls) >= 6
+    (x0, x1), (y0, y1) = axes.get_xlim(), axes.get_ylim()
+    assert all(x0 <= a and c <= x1 and y0 <= b and d <= y1 for a, b, c, d in plan.walls)
+    assert "[m]" in axes.get_xlabel()
+    assert {"goal", "start", "sub-goal 1"} <= {text.get_text() for text in axes.texts}
+
+
+def test_the_policy_is_drawn_only_where_the_robot_can_be(plan, axes):
+    figures.action_field(plan, learner("sga"), axes)
+    spokes = np.array(axes.collections[0].get_segments())[:, 0]
+    for x0, y0, x1, y1 in plan.walls:
+        inside = (spokes > (x0, y0)) & (spokes < (x1, y1))
+        assert not inside.all(1).any()
+    assert len(spokes) > 400
+
+
+def test_the_policy_bends_to_the_side_of_the_turn(plan, axes):
+    agent = learner("sga")
+    for value, side in ((1.0, 1), (-1.0, -1)):
+        with torch.no_grad():
+            agent.net.blocks[0][2 * agent.net.n_inputs] = value  # every rule turns to one side
+        axes.clear()
+        figures.action_field(plan, agent, axes, headings=4)
+        begin, end = np.array(axes.collections[0].get_segments())[0]  # heading -pi, to the west
+        assert math.copysign(1, -(end - begin)[1]) == side  # facing west, left is south
+
+
+def test_rule_map_shows_every_rule(plan, axes):
+    agent = learner("q", coding="antecedent")
+    figures.rule_map(plan, agent, axes, usage(agent, STATES))
+    dots = axes.collections[1]
+    assert dots.get_offsets().data == pytest.approx(STATES[:, :2], abs=1e-6)
+    assert len(set(dots.get_sizes())) > 1
+
+
+def test_learning_curves_are_medians_of_the_common_trials(tmp_path, axes):
+    tables = [[900, 700, 500, 480], [1000, 600, 520], [800, 800, 510]]
+    paths = []
+    for i, steps in enumerate(tables):
+        paths.append(tmp_path / f"{i}.csv")
+        rows = [f"{t},{n},True" for t, n in enumerate(steps, 1)]
+        paths[-1].write_text("\n".join(["trial,steps,success", *rows]) + "\n")
+    figures.learning_curves({"SOFNN": paths}, axes, reference=("optimum", 470))
+    median = next(line for line in axes.lines if line.get_label() == "SOFNN (3 seeds)")
+    assert median.get_xdata().tolist() == [1, 2, 3]
+    assert median.get_ydata().tolist() == [900, 700, 510]
+    assert axes.get_yscale() == "log"
+    assert figures.read_column(paths[0], "success").tolist() == [1, 1, 1, 1]
+    with pytest.raises(ValueError, match="rules"):
+        figures.read_column(paths[0], "rules")
+    with pytest.raises(ValueError, match="at most 5 arms"):
+        figures.learning_curves({str(i): paths for i in range(6)}, axes)
+
+
+def test_pose_error_is_in_millimetres_and_marks_the_subgoals(plan, axes):
+    true = np.array([[0.15, 0.15, 0], [0.5, 0.15, 0], [0.85, 0.333, 1], [0.5, 0.5, 3]])
+    estimated = true + np.array([[0, 0, 0], [0.003, 0.004, 0], [0, 0, 0], [0, -0.002, 0]])
+    figures.pose_error(Trajectory(true, estimated), axes, plan)
+    assert axes.lines[0].get_ydata() == pytest.approx([0, 5, 0, 2])
+    assert [text.get_text() for text in axes.texts] == ["sub-goal 1"]
+    assert "[mm]" in axes.get_ylabel()
+
+
+def test_a_figure_becomes_a_png_of_its_size(plan):
+    figure, (left, right) = figures.canvas(2, width=3, height=2)
+    path = Trajectory(STATES, STATES)
+    figures.trajectory(plan, path, left)
+    figures.value_field(plan, learner("sga"), right, columns=8, headings=2)
+    assert Image.open(io.BytesIO(figures.png(figure, dpi=50))).size == (300, 100)

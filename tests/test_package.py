@@ -1,0 +1,106 @@
+"""The installed package works away from the checkout: a wheel in a fresh virtual environment."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+import sysconfig
+import tomllib
+import venv
+import zipfile
+from pathlib import Path
+
+import pytest
+
+import sofnn_torch
+
+ROOT = Path(__file__).parents[1]
+
+
+def run(*command, cwd, **variables):
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", **variables}
+    environment.pop("PYTHONPATH", None)
+    done = subprocess.run(
+        [str(word) for word in command], cwd=cwd, env=environment, capture_output=True, text=True
+    )
+    assert done.returncode == 0, f"{command}\n{done.stdout}\n{done.stderr}"
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("wheel")
+    run(
+        *(sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", folder, ROOT),
+        cwd=folder,
+    )
+    (file,) = folder.glob("*.whl")
+    return file
+
+
+@pytest.fixture(scope="module")
+def home(wheel, tmp_path_factory):
+    """A virtual environment with the wheel; it borrows the dependencies of this one."""
+    folder = tmp_path_factory.mktemp("installed")
+    venv.create(folder / "venv", with_pip=False)
+    python = folder / "venv" / "bin" / "python"
+    run(
+        *(sys.executable, "-m", "pip", "--python", python, "install", "--quiet"),
+        *("--no-deps", "--no-index", wheel),
+        cwd=folder,
+    )
+    site = next((folder / "venv" / "lib").glob("python*")) / "site-packages"
+    (site / "borrowed.pth").write_text(sysconfig.get_path("purelib") + "\n")
+    return folder
+
+
+def test_the_wheel_holds_the_assets_and_no_tests(wheel):
+    names = set(zipfile.ZipFile(wheel).namelist())
+    assert "sofnn_torch/assets/khepera_maze.xml" in names
+    assert not [name for name in names if name.startswith(("tests", "docs", "runs"))]
+
+
+def test_the_installed_package_trains_and_evaluates_elsewhere(home):
+    scripts = home / "venv" / "bin"
+    look = (
+        "import gymnasium, sofnn_torch; print(sofnn_torch.__file__);"
+        "env = gymnasium.make('sofnn_torch:KheperaMaze-v0'); print(env.reset(seed=0)[0].shape)"
+    )
+    place, shape = run(scripts / "python", "-c", look, cwd=home).split("\n", 1)
+    assert Path(place).is_relative_to(home)
+    assert shape.strip() == "(3,)"
+    flags = ["--trials", "2", "--maze.max-steps", "100", "--quiet"]
+    run(scripts / "sofnn-train", *flags, cwd=home)
+    (directory,) = (home / "runs").iterdir()
+    table = run(
+        scripts / "sofnn-evaluate", directory, "--episodes", "2", "--json", "r.json", cwd=home
+    )
+    assert "2 trials learned" in table
+    assert len(json.loads((home / "r.json").read_text())["trials"]) == 2
+
+
+def test_constraints_pin_every_requirement():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    needed = [*project["dependencies"], *project["optional-dependencies"]["test"]]
+    lines = (ROOT / "constraints.txt").read_text().splitlines()
+    pinned = {line.split("==")[0].lower() for line in lines if "==" in line}
+    names = {requirement.split(">=")[0].split("[")[0].lower() for requirement in needed}
+    assert names <= pinned
+
+
+def test_the_version_is_the_same_everywhere():
+    citation = (ROOT / "CITATION.cff").read_text()
+    assert f"\nversion: {sofnn_torch.__version__}\n" in citation
+    assert f"## {sofnn_torch.__version__}" in (ROOT / "CHANGELOG.md").read_text()
+
+
+def test_the_examples_and_links_of_the_readme_work():
+    text = (ROOT / "README.md").read_text()
+    examples = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    assert len(examples) == 2
+    for example in examples:
+        exec(example, {})
+    links = re.findall(r"\]\(([^)#:]+)\)", text)
+    assert len(links) > 8
+    assert [link for link in links if not (ROOT / link).exists()] == []

@@ -1,0 +1,157 @@
+"""Pictures of the maze, drawn without a display."""
+
+import ctypes.util
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from sofnn_torch import rendering
+from sofnn_torch.maze import STRAIGHT, KheperaMazeEnv
+from sofnn_torch.physics import load_model
+from sofnn_torch.rendering import OffscreenRenderer, RenderingError, Viewer
+
+
+def can_draw():
+    """Return whether this machine has any OpenGL; where not, only messages can be tested."""
+    try:
+        OffscreenRenderer(load_model(), 16, 16).close()
+    except RenderingError:
+        return False
+    return True
+
+
+needs_gl = pytest.mark.skipif(not can_draw(), reason="no EGL, OSMesa or display")
+
+
+@pytest.fixture(scope="module")
+def draw():
+    model = load_model()
+    renderer = OffscreenRenderer(model, 160, 120)
+    start = model.key("start").qpos
+    yield lambda *args, **kwargs: renderer.draw(start, *args, **kwargs).astype(int)
+    renderer.close()
+
+
+@needs_gl
+def test_pictures_show_the_maze(draw):
+    top, chase = draw(), draw(camera="chase")
+    for picture in (top, chase):
+        assert picture.shape == (120, 160, 3)
+        assert picture.std() > 15  # not a blank frame
+        assert 60 < picture.mean() < 230  # neither dark nor burnt out
+    assert np.abs(top - chase).mean() > 10
+    assert (draw() == top).all()
+
+
+@needs_gl
+def test_the_goal_is_green_and_in_the_north_east(draw):
+    picture = draw()
+    red, green, blue = picture.transpose(2, 0, 1)
+    rows, columns = np.nonzero((green > red + 40) & (green > blue + 30))
+    assert np.median(rows) < 40 and np.median(columns) > 100
+
+
+@needs_gl
+def test_trail_and_ghost_are_drawn_where_they_are(draw):
+    plain = draw()
+    trail = draw([(0.2, 0.15), (0.5, 0.15), (0.5, 0.15), (0.8, 0.15)])
+    rows, columns = np.nonzero(np.abs(trail - plain).max(axis=2) > 30)
+    assert rows.size and (rows > 90).all() and (rows < 110).all()  # y = 0.15 m, seen from above
+    ghost = draw(estimate=(0.5, 0.85, 0.3))
+    rows, columns = np.nonzero(np.abs(ghost - plain).max(axis=2) > 20)
+    assert np.median(columns) == pytest.approx(80, abs=6) and np.median(rows) < 30
+
+
+@needs_gl
+def test_a_very_long_trail_is_thinned_out(draw):
+    way = np.random.default_rng(0).uniform(0.1, 0.9, (20_000, 2))
+    assert np.abs(draw(way.tolist()) - draw()).mean() > 5
+
+
+@needs_gl
+def test_the_environment_draws_itself():
+    env = KheperaMazeEnv(render_mode="rgb_array", width=96, height=64)
+    env.reset(seed=0)
+    before = env.render()
+    env.step(STRAIGHT)
+    after = env.render()
+    assert before.shape == (64, 96, 3) and before.dtype == np.uint8
+    assert (before != after).any()
+    env.camera = "chase"
+    assert (env.render() != after).any()
+    env.close()
+    env.close()
+
+
+@needs_gl
+def test_unknown_cameras_and_sizes_are_refused(draw):
+    with pytest.raises(ValueError, match=r"\['top', 'chase'\]"):
+        draw(camera="side")
+    with pytest.raises(ValueError, match="not 9000 x 64"):
+        OffscreenRenderer(load_model(), 9000, 64)
+
+
+def test_rendering_needs_a_mode():
+    env = KheperaMazeEnv()
+    env.reset()
+    with pytest.warns(UserWarning, match="render_mode"):
+        assert env.render() is None
+
+
+@pytest.fixture
+def headless(monkeypatch):
+    for name in ("MUJOCO_GL", "DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(sys, "platform", "linux")
+    return monkeypatch
+
+
+def test_egl_is_preferred_then_osmesa(headless):
+    installed = {"EGL", "OSMesa"}
+    headless.setattr(ctypes.util, "find_library", lambda name: name in installed or None)
+    assert rendering.choose_backend() == "egl"
+    installed.remove("EGL")
+    assert rendering.choose_backend() == "osmesa"
+    headless.setenv("MUJOCO_GL", "EGL")
+    assert rendering.choose_backend() == "egl"
+    headless.delenv("MUJOCO_GL")
+    headless.setenv("DISPLAY", ":0")
+    assert rendering.choose_backend() == "glfw"
+
+
+def test_without_opengl_one_line_says_what_to_install(headless):
+    headless.setattr(ctypes.util, "find_library", lambda name: None)
+    env = KheperaMazeEnv(render_mode="rgb_array")
+    env.reset()
+    with pytest.raises(RenderingError, match=r"libegl1.*libosmesa6") as error:
+        env.render()
+    assert "\n" not in str(error.value)
+
+
+def test_the_viewer_without_a_display_says_so(headless):
+    with pytest.raises(RenderingError, match="display"):
+        Viewer(load_model())
+    with pytest.raises(RenderingError, match="display"):
+        KheperaMazeEnv(render_mode="human").reset()
+
+
+@pytest.mark.parametrize(("backend", "library"), [("egl", "EGL"), ("osmesa", "OSMesa")])
+def test_a_backend_works_although_mujoco_was_imported_before(backend, library):
+    if not (sys.platform == "linux" and ctypes.util.find_library(library)):
+        pytest.skip(f"{library} is not installed")
+    code = """
+import os, mujoco, sys
+os.environ["MUJOCO_GL"] = sys.argv[1]
+import gymnasium
+env = gymnasium.make("sofnn_torch:KheperaMaze-v0", render_mode="rgb_array", width=64, height=64)
+env.reset(seed=0)
+print(env.render().std() > 15)
+env.close()
+"""
+    variables = {k: v for k, v in os.environ.items() if k not in ("MUJOCO_GL", "PYOPENGL_PLATFORM")}
+    command = [sys.executable, "-c", code, backend]
+    run = subprocess.run(command, capture_output=True, text=True, env=variables, check=False)
+    assert run.stdout.strip() == "True" and run.stderr == "", run.stderr

@@ -1,0 +1,122 @@
+"""A run that is killed and resumed ends as one that never stopped, to the last bit."""
+
+import random
+import signal
+import time
+from dataclasses import replace
+
+import doomed
+import pytest
+from conftest import assert_same_run, quick_options, settings
+
+from sofnn_torch.runs import default_name
+
+# Both learners, all poses, growing and fixed networks, learned antecedents, every action type.
+CASES = {
+    "sga": settings(trials=12),
+    "q": settings("q", pose="true", trials=12),
+    "sga-antecedents": settings(
+        pose="odometry",
+        trials=6,
+        net={"growth": "input", "theta": 0.7},
+        sga={"actions": "wheels", "rate_centre": 0.01, "rate_width": 0.01},
+    ),
+    "q-antecedent": settings(
+        "q", trials=6, q={"coding": "antecedent", "rate_centre": 1e-4, "rate_width": 1e-4}
+    ),
+    "q-fixed": settings("q", "fixed", pose="odometry", trials=6),
+    "sga-literal": settings(
+        trials=6, maze={"dead_reckoning": "literal", "wheel_noise": "independent"}
+    ),
+    "sga-two-blocks": settings(
+        trials=3, maze={"max_steps": 6000}, net={"theta": 0.9, "width_position": 0.01}
+    ),
+    "q-to-the-goal": settings("q", trials=3, maze={"max_steps": 20_000}),
+}
+FAST = ("sga", "q")
+
+
+@pytest.fixture(scope="module")
+def references(tmp_path_factory):
+    """Uninterrupted runs by case, made when first asked for, with their counts of moments."""
+    made = {}
+
+    def reference(case):
+        if case not in made:
+            runs = tmp_path_factory.mktemp(case)
+            run = runs / default_name(CASES[case])
+            made[case] = run, doomed.count_moments(CASES[case], quick_options(runs), run)
+        return made[case]
+
+    return reference
+
+
+def live_through(case, tmp_path, moments, number=signal.SIGKILL):
+    """Train, die at each moment in turn, resume until done; run directory and exit codes."""
+    config, options = CASES[case], quick_options(tmp_path)
+    run = tmp_path / default_name(config)
+    codes = [doomed.finish(doomed.start(config, options, run, m, number)) for m in moments]
+    assert doomed.finish(doomed.start(config, options, run)) == 0
+    return run, codes
+
+
+def assert_same_end(run, reference):
+    assert_same_run(run, reference)
+    assert not list(run.glob(".*")) and not list(run.glob("*.unused"))
+
+
+@pytest.mark.parametrize("kind", doomed.MOMENTS)
+@pytest.mark.parametrize("case", FAST)
+def test_a_killed_run_resumes_bit_for_bit(case, kind, references, tmp_path):
+    reference, counts = references(case)
+    moment = (kind, counts[kind] * 2 // 3)
+    run, codes = live_through(case, tmp_path, [moment])
+    assert codes == [-signal.SIGKILL]
+    assert_same_end(run, reference)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("kind", ["decision", "file", "fsync"])
+def test_a_signal_saves_the_run_and_resume_goes_on_bit_for_bit(number, kind, references, tmp_path):
+    reference, counts = references("sga")
+    run, codes = live_through("sga", tmp_path, [(kind, counts[kind] // 2)], number)
+    assert codes == [128 + number]
+    assert_same_end(run, reference)
+
+
+def test_a_run_killed_again_and_again_resumes_bit_for_bit(references, tmp_path):
+    reference, _ = references("sga")
+    moments = [("decision", 40), ("half written", 4), ("fsync", 3), ("decision", 15)]
+    run, codes = live_through("sga", tmp_path, moments)
+    assert codes == [-signal.SIGKILL] * 4
+    assert_same_end(run, reference)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("point", range(5))
+@pytest.mark.parametrize("kind", doomed.MOMENTS)
+@pytest.mark.parametrize("case", CASES)
+def test_any_kill_point(case, kind, point, references, tmp_path):
+    reference, counts = references(case)
+    moment = (kind, random.Random(f"{case} {kind} {point}").randint(1, counts[kind]))
+    run, _ = live_through(case, tmp_path, [moment])
+    assert_same_end(run, reference)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", CASES)
+def test_kills_by_the_clock(case, references, tmp_path):
+    """The kill comes from outside, after a random time, until the run is done."""
+    reference, _ = references(case)
+    config, options = replace(CASES[case]), quick_options(tmp_path)
+    run, clock, kills = tmp_path / default_name(config), random.Random(case), 0
+    while True:
+        child = doomed.start(config, options, run)
+        time.sleep(clock.uniform(0.02, 0.3))
+        child.kill()
+        if doomed.finish(child) == 0:
+            break
+        kills += 1
+        assert kills < 100
+    assert kills
+    assert_same_end(run, reference)
