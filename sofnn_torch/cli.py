@@ -5,13 +5,9 @@ by SIGINT and SIGTERM after saving.
 """
 
 import argparse
-import contextlib
 import dataclasses
-import io
-import re
 import signal
 import sys
-import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,8 +20,9 @@ if __name__ == "__main__":  # Ctrl-C while libraries load: there is nothing to s
 
 from sofnn_torch import runs, seeds, training
 from sofnn_torch.config import Config, preset
+from sofnn_torch.flags import parse as parse_flags
 from sofnn_torch.guard import Divergence, Interrupted
-from sofnn_torch.training import RunOptions
+from sofnn_torch.session import RunOptions, saved_config
 
 EXAMPLES = """Train a robot to find its way with a self-organizing fuzzy neural network.
 
@@ -59,7 +56,6 @@ class Flags:
 def main(argv: Sequence[str] | None = None) -> int:
     """Train as the flags say; the exit code."""
     argv = list(sys.argv[1:] if argv is None else argv)
-    threading.excepthook = _note_thread
     try:
         flags = parse(argv)
         if flags.replay:
@@ -77,7 +73,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _fail(error, 1)
     except Interrupted as stop:
         if stop.run:
-            print(f"stopped and saved; go on with: {_program()} --resume {stop.run}")
+            runs.say(f"stopped and saved; go on with: {_program()} --resume {stop.run}")
         return 128 + stop.number
     return 0
 
@@ -95,16 +91,18 @@ def parse(argv: Sequence[str]) -> Flags:
     first.add_argument("--resume", type=Path)
     known, _ = first.parse_known_args(argv)
     if known.resume and not {"-h", "--help"} & set(argv):
-        base = training.saved_config(known.resume)
+        base = saved_config(known.resume)
     else:
         base = _preset(known)
-    flags = _tyro(argv, Flags(config=base, options=RunOptions()))
+    flags = parse_flags(Flags, argv, EXAMPLES, Flags(config=base, options=RunOptions()))
     if flags.resume:
         _keep_settings(flags, base)
     for agent in {"sga", "q"} - {flags.config.agent}:
         if changed := _difference(getattr(flags.config, agent), getattr(base, agent)):
             flag = _flag(f"{agent}.{changed}")
             raise ValueError(f"{flag} has no effect with --agent {flags.config.agent}")
+    if flags.seeds is not None and flags.config.seed != base.seed:
+        raise ValueError("--seed and --seeds exclude each other")
     if flags.workers < 1:
         raise ValueError(f"--workers must be at least 1, got {flags.workers}")
     return flags
@@ -119,24 +117,6 @@ def _preset(known: argparse.Namespace) -> Config:
     if known.network not in ("sofnn", "fixed"):
         raise ValueError(f"--network must be sofnn or fixed, got {known.network!r}")
     return preset(known.agent, known.network, known.preset)
-
-
-def _tyro(argv: Sequence[str], default: Flags) -> Flags:
-    """Parse with tyro, its framed messages made one line."""
-    messages = io.StringIO()
-    try:
-        with contextlib.redirect_stderr(messages):
-            return tyro.cli(Flags, default=default, args=argv, description=EXAMPLES)
-    except SystemExit as stop:
-        if not stop.code:
-            raise
-    lines = [line.strip("│ ") for line in messages.getvalue().splitlines()]
-    lines = [line for line in lines if line and not line.startswith("╭")]
-    what = " ".join(lines[: next((i for i, x in enumerate(lines) if x.startswith("─")), 1)])
-    hint = next((m[1] for line in lines[1:] if (m := re.match(r"(--[\w.-]+)", line))), None)
-    if hint and "nrecognized" in what:
-        what += f"; did you mean {hint}?"
-    raise ValueError(f"{what} (--help lists all flags)")
 
 
 def _keep_settings(flags: Flags, base: Config) -> None:
@@ -167,11 +147,6 @@ def _flag(name: str) -> str:
 def _program() -> str:
     name = Path(sys.argv[0]).name
     return name if name.startswith("sofnn") else "python train.py"
-
-
-def _note_thread(failure: threading.ExceptHookArgs) -> None:
-    """One line instead of a traceback: TensorBoard's writer thread on a full disk."""
-    runs.say(f"warning: {failure.thread.name if failure.thread else 'thread'}: {failure.exc_value}")
 
 
 def _fail(error: Exception, code: int) -> int:

@@ -37,7 +37,7 @@ class NetworkConfig:
     """Width v of new membership functions on the heading, in radians."""
     width_action: float = 0.3
     """Width v on the action, where the action is an antecedent (`--q.coding antecedent`)."""
-    interpolate: bool = True
+    interpolate: bool = False
     """A new rule takes over the policy that the network had there (SGA), or the action values
     (Q-learning), instead of the initial ones."""
     grid: tuple[int, int, int] = (12, 12, 8)
@@ -71,7 +71,7 @@ class SGAConfig:
     """Learning rate of the centres u; 0 leaves them where they were put."""
     rate_width: float = 0.0
     """Learning rate of the widths v; 0 leaves them as they are."""
-    rate_value: float = 0.5
+    rate_value: float = 1.0
     """Learning rate of the value consequents (baseline `value`)."""
     one_minus_gamma: bool = False
     """Multiply the policy's learning rates by (1 - gamma), as eq. 8 prints."""
@@ -112,9 +112,9 @@ class QConfig:
     """Bound of the consequents' traces; None for no bound."""
     rate_state: float = 0.0
     """Learning rate of c_x."""
-    rate_action: float = 1.0
+    rate_action: float = 0.3
     """Learning rate of c_a."""
-    rate_constant: float = 0.0
+    rate_constant: float = 0.7
     """Learning rate of c."""
     rate_centre: float = 0.0
     """Learning rate of the centres u; 0 leaves them where they were put."""
@@ -172,7 +172,7 @@ class Config:
     """Settings that the other flags change: what works best, or every number as printed."""
     seed: int = 0
     """Seed of every random number of the run."""
-    trials: int = 150
+    trials: int = 200
     """Trials to learn for."""
     net: NetworkConfig = field(default_factory=NetworkConfig)
     sga: SGAConfig = field(default_factory=SGAConfig)
@@ -198,7 +198,7 @@ def preset(agent: str, network: str, name: str) -> Config:
         raise ValueError(f"no preset {name!r} for agent {agent!r}")
     if name == "paper":
         return _paper(agent, network)
-    net = NetworkConfig(interpolate=agent == "sga")
+    net = NetworkConfig(theta=0.4 if agent == "sga" else 0.3)
     if network == "fixed":  # half the grid's spacing
         net = dataclasses.replace(net, width_position=0.042, width_heading=0.39)
     if agent == "sga":
@@ -213,7 +213,7 @@ def preset(agent: str, network: str, name: str) -> Config:
 
 def _paper(agent: str, network: str) -> Config:
     """Every number as printed; where the paper is silent, the reading of docs/paper.md."""
-    net = NetworkConfig(theta=0.5, grid=(12, 12, 8))
+    net = NetworkConfig(theta=0.5)
     sga_settings = SGAConfig(
         trace_decay=1.0,
         baseline="constant",
@@ -260,7 +260,7 @@ def from_dict(data: Any, kind: Any = Config, where: str = "") -> Any:
         raise ValueError(f"{where or 'the settings'}: a table of names and values is needed")
     hints = typing.get_type_hints(kind)
     if unknown := sorted(str(name) for name in data.keys() - hints.keys()):
-        raise ValueError(f"{where}{unknown[0][:60]} is not a setting of this version")
+        raise ValueError(f"{where + unknown[0][:60]!r} is not a setting of this version")
     return kind(**{name: _typed(data[name], hints[name], f"{where}{name}") for name in data})
 
 

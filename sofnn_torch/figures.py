@@ -273,7 +273,7 @@ def read_column(path: Path, column: str) -> NDArray[np.float64]:
 
 @styled
 def learning_curves(
-    arms: Mapping[str, Sequence[Path]],
+    arms: Mapping[str, Sequence[Path | NDArray[Any]]],
     ax: Axes,
     column: str = "steps",
     label: str = "steps to the goal",
@@ -282,7 +282,8 @@ def learning_curves(
     """Median and interquartile band over seeds for each arm, every seed drawn faintly.
 
     Args:
-        arms: name of each arm and the ``trials.csv`` of its seeds; the shortest ends the curve.
+        arms: name of each arm and the ``trials.csv`` of its seeds, or their columns (trials,);
+            the shortest ends the curve.
         ax: where to draw.
         column: column of the file.
         label: label of the vertical axis, with its unit.
@@ -293,8 +294,8 @@ def learning_curves(
     """
     if len(arms) > len(SERIES):
         raise ValueError(f"at most {len(SERIES)} arms can be told apart, got {len(arms)}")
-    for (name, paths), (colour, line) in zip(arms.items(), SERIES, strict=False):
-        curves = [read_column(path, column) for path in paths]
+    for (name, runs), (colour, line) in zip(arms.items(), SERIES, strict=False):
+        curves = [run if isinstance(run, np.ndarray) else read_column(run, column) for run in runs]
         length = min(map(len, curves))
         table, trials = np.array([c[:length] for c in curves]), np.arange(1, length + 1)
         if len(curves) > 1:

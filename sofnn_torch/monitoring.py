@@ -18,11 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 from tensorboard.compat.proto.summary_pb2 import Summary
-from torch.utils.tensorboard import SummaryWriter
 from torch.utils.tensorboard.summary import hparams
 
 from sofnn_torch import figures
 from sofnn_torch.config import Agent, Config, make_env
+from sofnn_torch.events import EventFile
 from sofnn_torch.physics import load_model
 from sofnn_torch.rendering import OffscreenRenderer
 from sofnn_torch.runs import flatten, say
@@ -103,7 +103,8 @@ class Monitor:
         self.successes: deque[float] = deque(self._earlier_successes(first_trial), maxlen=WINDOW)
         self._plan = None
         self._broken: set[str] = set()
-        self._writer: SummaryWriter | None = None
+        self._warned = False
+        self._events: EventFile | None = None
         self._guard("TensorBoard", lambda: self._open(first_trial))
 
     def trial(
@@ -125,47 +126,51 @@ class Monitor:
             self._guard("video", lambda: self._video(record.trial, agent))
 
     def flush(self) -> None:
-        """Write what is still in memory."""
-        if self._writer is not None:
-            self._guard("TensorBoard", self._writer.flush)
+        """Hand what was written to the operating system."""
+        if self._events is not None:
+            self._guard("TensorBoard", self._events.flush)
 
     def close(self) -> None:
         """Write what is still in memory and give the file back."""
-        if self._writer is not None:
-            self._guard("TensorBoard", self._writer.close)
-            self._writer = None
+        if self._events is not None:
+            self._guard("TensorBoard", self._events.close)
+            self._events = None
 
     def _guard(self, part: str, action: Callable[[], None]) -> None:
-        """Run an action unless its part failed before; say a failure once and go on without."""
-        if part in self._broken or "TensorBoard" in self._broken:
+        """Run an action; say a failure once and go on without, or try again if it is the disk."""
+        if part in self._broken:
             return
         try:
             action()
-        except Exception as error:  # disk, GL and drawing fail in many ways; none may end a run
+        except OSError as error:
+            self._events = None
+            if not self._warned:
+                self._warned = True
+                say(
+                    f"warning: no TensorBoard in {self.run_dir} for now, training goes on "
+                    f"({error.strerror or error})"
+                )
+        except Exception as error:  # GL and drawing fail in many ways; none may end a run
             self._broken.add(part)
             reason = " ".join(str(error).split()) or type(error).__name__
             say(f"warning: no {part} from now on, training goes on ({reason})")
 
-    def _open(self, first_trial: int) -> None:
-        # TensorBoard drops the steps from purge_step on that it has read before, but only where
-        # the earlier file announced a purge step too: hence also in a fresh run.
-        self._writer = SummaryWriter(str(self.run_dir), purge_step=first_trial, flush_secs=10)
-        if first_trial == 1:
-            self._hparams()
+    def _open(self, trial: int) -> None:
+        self._events = EventFile(self.run_dir, trial)
+        self._hparams()
 
     def _hparams(self) -> None:
-        """Write the settings into this run; `SummaryWriter.add_hparams` would make a second."""
+        """Write the settings into this run; torch's `add_hparams` would make a second."""
         settings = flatten(dataclasses.asdict(self.config))
         plain = {
             name: value if isinstance(value, bool | int | float | str) else str(value)
             for name, value in settings.items()
         }
         for summary in hparams(plain, dict.fromkeys(HPARAM_METRICS)):
-            self._writer.file_writer.add_summary(summary)
+            self._events.add(summary)
 
     def _scalars(self, record: TrialRecord, steps_per_second: float) -> None:
-        if not any(self.run_dir.glob("events.out.tfevents.*")):  # deleted while the run goes on
-            self._writer.close()
+        if self._events is None or not self._events.path.exists():  # the disk failed, or deleted
             self._open(record.trial)
         values = {
             "trial/steps": record.steps,
@@ -182,11 +187,11 @@ class Monitor:
             "pose/heading_error_mean": record.heading_error,
             "speed/steps_per_second": steps_per_second,
         }
-        # One event for all of them: a tenth of the time that one event each takes.
         scalars = [
             Summary.Value(tag=k, simple_value=v) for k, v in (values | record.statistics).items()
         ]
-        self._writer.file_writer.add_summary(Summary(value=scalars), record.trial)
+        self._events.add(Summary(value=scalars), record.trial)
+        self._events.flush()
 
     def _pictures(self, trial: int, path: Trajectory, agent: Agent) -> None:
         if self._plan is None:
@@ -215,7 +220,8 @@ class Monitor:
         width, height = Image.open(io.BytesIO(data)).size
         image = Summary.Image(width=width, height=height, colorspace=3, encoded_image_string=data)
         summary = Summary(value=[Summary.Value(tag=name, image=image)])
-        self._writer.file_writer.add_summary(summary, trial)
+        if self._events is not None:
+            self._events.add(summary, trial)
 
     @staticmethod
     def _due(trial: int, every: int) -> bool:

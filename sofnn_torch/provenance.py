@@ -14,7 +14,7 @@ import sofnn_torch
 
 
 def versions() -> dict[str, str]:
-    """Versions of all that numerical results depend on."""
+    """Versions and number of threads: all that the last bits of a result depend on."""
     return {
         "sofnn_torch": sofnn_torch.__version__,
         "python": platform.python_version(),
@@ -22,6 +22,7 @@ def versions() -> dict[str, str]:
         "numpy": numpy.__version__,
         "mujoco": mujoco.__version__,
         "gymnasium": gymnasium.__version__,
+        "threads": str(torch.get_num_threads()),
         "machine": f"{platform.system()} {platform.machine()}",
     }
 

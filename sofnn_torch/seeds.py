@@ -6,6 +6,7 @@ is killed takes no other with it.
 
 import contextlib
 import dataclasses
+import os
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -21,6 +22,10 @@ from sofnn_torch.runs import say
 from sofnn_torch.training import RunOptions
 
 OWN = {"--seeds", "--workers", "--name", "--seed"}  # flags that the single runs do not inherit
+MOST = 10_000  # seeds in one call
+HOME = str(Path(__file__).parents[1])  # the children must find this package, installed or not
+PATHS = [HOME, *filter(None, [os.environ.get("PYTHONPATH")])]
+ENVIRONMENT = os.environ | {"PYTHONPATH": os.pathsep.join(PATHS)}
 
 
 def train(
@@ -51,7 +56,9 @@ def train(
         ) as bar,
     ):
         parallel = Parallel(n_jobs=workers, backend="threading", return_as="generator_unordered")
-        for number, path, code, message in parallel(delayed(_one)(*job, bar, trap) for job in jobs):
+        for number, path, code, message in parallel(
+            delayed(watch)(*job, bar, trap) for job in jobs
+        ):
             failed += code != 0
             say(f"seed {number}: {'done' if code == 0 else message}, {path}")
     if trap.number:
@@ -71,19 +78,21 @@ def parse(listed: str) -> list[int]:
     with contextlib.suppress(ValueError):
         for part in listed.split(","):
             low, dash, high = part.partition("-")
-            numbers += range(int(low), int(high if dash else low) + 1)
-        if numbers and len(set(numbers)) == len(numbers):
+            numbers += range(int(low), int(high if dash else low) + 1)[:MOST]
+        if numbers and len(set(numbers)) == len(numbers) < MOST:
             return numbers
     raise ValueError(f"--seeds must be a list such as 0-7 or 0,3,5, got {listed!r}")
 
 
-def _one(
+def watch(
     number: int, path: Path, command: list[str], bar: tqdm, trap: SignalTrap
 ) -> tuple[int, Path, int, str]:
-    """Train one seed and wait for it; its number, directory, exit code and last message."""
+    """Run the command of a training to its end; its number, directory, exit code and message."""
     if trap.number:
         return number, path, 128 + trap.number, "not started"
-    child = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+    child = subprocess.Popen(
+        command, env=ENVIRONMENT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+    )
     shown = 0
     while True:
         try:

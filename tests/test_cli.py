@@ -23,7 +23,7 @@ from sofnn_torch.config import Config, from_dict, make_agent, preset
 from sofnn_torch.runs import load_config
 
 ROOT = Path(__file__).parents[1]
-QUICK = "--quiet --picture-every 0 --video-every 0 --maze.max-steps 100".split()
+QUICK = ["--quiet", "--picture-every=0", "--video-every=0", "--maze.max-steps=100"]
 
 
 @pytest.fixture
@@ -108,12 +108,11 @@ def test_flags_that_agree_with_the_run_are_fine(run):
 
 
 def test_train_py_is_the_same_program(here):
-    command = [sys.executable, str(ROOT / "train.py"), "--trials", "1", *QUICK]
+    command = [sys.executable, str(ROOT / "train.py"), "--tirals", "1"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120)
-    assert done.returncode == 0 and "done" in done.stdout
-    refused = subprocess.run([*command, "--tirals", "1"], capture_output=True, text=True)
-    assert refused.returncode == 2
-    assert len(refused.stderr.splitlines()) == 1 and "Traceback" not in refused.stderr
+    assert done.returncode == 2
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("error: Unrecognized options: --tirals, 1; did you mean --trials?")
 
 
 def test_interruption_says_how_to_go_on(here, monkeypatch, capsys):
@@ -125,7 +124,7 @@ def test_interruption_says_how_to_go_on(here, monkeypatch, capsys):
 
     monkeypatch.setattr(training, "play", interrupted)
     assert main(["--trials", "2", *QUICK]) == 130
-    assert "--resume runs/sga-sofnn-estimated-s0" in capsys.readouterr().out
+    assert "--resume runs/sga-sofnn-estimated-s0" in capsys.readouterr().err
 
 
 def test_divergence_is_one_line_and_exit_code_1(here, capsys):
@@ -183,6 +182,8 @@ def test_divergence_is_one_line_and_exit_code_1(here, capsys):
         ("--seeds 3-1", "--seeds must be a list"),
         ("--seeds 1,x", "--seeds must be a list"),
         ("--seeds 1,1", "--seeds must be a list"),
+        ("--seeds 0-99999999999999", "--seeds must be a list"),
+        ("--seeds 0-3 --seed 7", "--seed and --seeds exclude each other"),
         ("--seeds 0-3 --workers 0", "--workers must be at least 1"),
         ("--resume nowhere", "not a run directory"),
         ("--replay nowhere", "cannot be read"),
@@ -242,6 +243,7 @@ def test_a_damaged_checkpoint_gets_one_clear_line(run, capsys):
 # ------------------------------------------------------------------------------------ many seeds
 
 
+@pytest.mark.slow
 def test_several_seeds_in_one_call(here, capsys):
     assert main(["--seeds", "0,2", "--workers", "2", "--trials", "2", *QUICK]) == 0
     for seed in (0, 2):
@@ -262,7 +264,7 @@ def test_a_crash_of_one_seed_leaves_the_others(here, capsys, monkeypatch):
         return child
 
     monkeypatch.setattr(seeds.subprocess, "Popen", popen)
-    assert main(["--seeds", "0-1", "--workers", "1", "--trials", "1", *QUICK]) == 1
+    assert main(["--seeds", "0-1", "--workers", "2", "--trials", "1", *QUICK]) == 1
     err = capsys.readouterr().err
     assert "seed 0: done" in err and "seed 1: exit code -9" in err and "1 of 2" in err
     assert checkpoint.find_latest(Path("runs/sga-sofnn-estimated-s0"))[1]["trial"] == 1
@@ -279,7 +281,9 @@ def test_a_signal_stops_all_seeds_after_saving(here):
     while not (run / "trials.csv").exists() and time.monotonic() < deadline:
         time.sleep(0.1)
     child.send_signal(signal.SIGTERM)
-    assert child.wait(60) == 128 + signal.SIGTERM
+    _, messages = child.communicate(timeout=120)
+    assert child.returncode == 128 + signal.SIGTERM
+    assert f"--resume {run}" in messages
     state = checkpoint.find_latest(run)[1]
     assert state["trial"] == len((run / "trials.csv").read_text().splitlines()) - 1 > 0
     assert [path.name for path in Path("runs").iterdir()] == [run.name]
@@ -301,7 +305,6 @@ plain = st.recursive(
     ),
     max_leaves=5,
 )
-names = sorted(training.runs.flatten(asdict(Config()))) if hasattr(training, "runs") else []
 
 
 def places(tree, place=()):
@@ -355,19 +358,9 @@ def test_any_config_file_is_refused_in_one_line(data):
             assert str(error).startswith(directory) and "\n" not in str(error)
 
 
-words = st.sampled_from(
-    [
-        "--agent",
-        "--net.theta",
-        "--trials",
-        "--seeds",
-        "--q.gamma",
-        "--name",
-        "--net.grid",
-        "--quiet",
-    ]
-    + ["q", "sga", "0.5", "3", "-1", "nan", "None", "--", "--no-quiet", "=", "--net.theta=0.3"]
-) | st.text(st.characters(codec="utf-8", exclude_characters="\x00"), max_size=6)
+FLAGS = ["--agent", "--net.theta", "--trials", "--seeds", "--q.gamma", "--name", "--net.grid"]
+VALUES = ["q", "sga", "0.5", "3", "-1", "nan", "None", "--", "--quiet", "=", "--net.theta=0.3"]
+words = st.sampled_from(FLAGS + VALUES) | st.text(max_size=6)
 
 
 @settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -376,7 +369,7 @@ def test_any_arguments_are_parsed_or_refused_in_one_line(arguments):
     try:
         assert isinstance(parse(arguments), cli.Flags)
     except ValueError as error:
-        assert str(error)
+        assert "\n" not in str(error).strip()
 
 
 def test_a_config_survives_its_file(tmp_path):

@@ -9,7 +9,7 @@ import imageio.v3 as imageio
 import numpy as np
 import pytest
 
-from sofnn_torch import evaluate
+from sofnn_torch import evaluate, flags
 from sofnn_torch.config import preset
 from sofnn_torch.monitoring import TrialRecord
 from sofnn_torch.rendering import RenderingError
@@ -175,3 +175,16 @@ def test_a_checkpoint_of_other_settings_is_refused(trained, tmp_path, monkeypatc
     (copy / "config.json").write_text(json.dumps(settings))
     assert call(monkeypatch, copy) == 2
     assert "net.theta" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "framed",
+    [
+        "╭─ Unrecognized options ──╮\n│ Unrecognized options: --n │\n│ ─────────────────── │\n"
+        "│ Perhaps you meant:       │\n│     --name STR            │\n╰─────────────────────╯\n",
+        " Unrecognized options \n -------------------- \n Unrecognized options: --n \n"
+        " -------------------- \n Perhaps you meant: \n     --name STR \n",
+    ],
+)
+def test_framed_messages_become_one_line_with_any_encoding(framed):
+    assert flags._first_message(framed) == "Unrecognized options: --n; did you mean --name?"

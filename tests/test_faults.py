@@ -94,7 +94,6 @@ def fill(disk):
             assert error.errno == errno.ENOSPC
 
 
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
 def test_a_disk_full_for_a_while_costs_nothing(small_disk, reference, between_trials, capsys):
     between_trials(
         before_2=lambda: fill(small_disk), before_4=lambda: (small_disk / "filler").unlink()
@@ -105,7 +104,6 @@ def test_a_disk_full_for_a_while_costs_nothing(small_disk, reference, between_tr
     assert not list(run.glob(".*.tmp"))
 
 
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
 def test_a_full_disk_keeps_the_old_checkpoint_and_saves_elsewhere(
     small_disk, reference, between_trials, tmp_path, monkeypatch
 ):
@@ -224,12 +222,16 @@ def test_a_signal_between_trials_saves_what_is_done(number, options, between_tri
     assert [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)] == handlers
 
 
-def test_a_bug_in_a_trial_saves_what_is_done(options, reference, between_trials):
+@pytest.mark.parametrize("kind", [ValueError, RuntimeError, MemoryError])
+def test_a_bug_in_a_trial_saves_what_is_done_and_is_not_hidden(
+    kind, options, reference, between_trials
+):
     def fail():
-        raise RuntimeError("a bug")
+        raise kind("a bug")
 
     between_trials(before_4=fail)
-    with pytest.raises(RuntimeError, match="a bug"):
+    # A ValueError would pass for bad input of the user.
+    with pytest.raises(RuntimeError if kind is ValueError else kind, match="a bug"):
         training.train(settings(), quick_options(options.runs, checkpoint_every=100))
     training.resume(options.runs / NAME, options)
     same_end(options.runs / NAME, reference)
@@ -242,7 +244,7 @@ def test_training_goes_on_without_tensorboard(options, reference, monkeypatch, c
     def refuse(*_, **__):
         raise PermissionError(errno.EACCES, "Permission denied")
 
-    monkeypatch.setattr(monitoring, "SummaryWriter", refuse)
+    monkeypatch.setattr(monitoring, "EventFile", refuse)
     run = training.train(settings(), options)
     same_end(run, reference)
     (line,) = warnings(capsys)

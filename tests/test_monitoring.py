@@ -15,6 +15,7 @@ from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
 
 from sofnn_torch import monitoring
 from sofnn_torch.config import make_agent, make_env, preset
+from sofnn_torch.events import EventFile
 from sofnn_torch.monitoring import Monitor, film, gif
 from sofnn_torch.rendering import RenderingError
 from sofnn_torch.training import play
@@ -151,7 +152,29 @@ def test_a_directory_that_cannot_be_written_costs_one_warning(tmp_path, sga_tria
     monitor.close()
     warnings = capsys.readouterr().err.strip().splitlines()
     assert len(warnings) == 1
-    assert "no TensorBoard from now on" in warnings[0]
+    assert "no TensorBoard" in warnings[0]
+
+
+def test_a_full_disk_costs_one_warning_and_what_it_refused(
+    tmp_path, sga_trial, capsys, monkeypatch
+):
+    config, agent, record, path = sga_trial
+    monitor = Monitor(tmp_path, config, picture_every=1, video_every=0)
+
+    def full(*_args):
+        raise OSError(28, "No space left on device")
+
+    monitor.trial(record, path, agent, 1.0)
+    with monkeypatch.context() as disk:
+        disk.setattr(EventFile, "_add", full)
+        for trial in (2, 3):
+            monitor.trial(numbered(record, trial), path, agent, 1.0)
+    monitor.trial(numbered(record, 4), path, agent, 1.0)
+    monitor.close()
+    (warning,) = capsys.readouterr().err.strip().splitlines()
+    assert "no TensorBoard" in warning
+    assert "No space left" in warning
+    assert list(scalar(events(tmp_path), "trial/steps")) == [1, 4]
 
 
 def test_no_rendering_costs_one_warning_and_the_video(tmp_path, sga_trial, capsys, monkeypatch):
@@ -176,7 +199,7 @@ def test_a_deleted_event_file_is_made_anew(tmp_path, sga_trial):
     monitor = Monitor(tmp_path, config, picture_every=0)
     monitor.trial(record, path, agent, 1.0)
     monitor.flush()
-    for file in tmp_path.glob("events*"):
+    for file in tmp_path.iterdir():
         file.unlink()
     monitor.trial(numbered(record, 2), path, agent, 1.0)
     monitor.close()

@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import json
 import os
 import random
 import threading
@@ -13,15 +14,10 @@ import torch
 from conftest import equal, quick_options, scalars, settings
 
 from sofnn_torch import checkpoint, training
-from sofnn_torch.config import make_agent, make_env
+from sofnn_torch.config import make_env
 from sofnn_torch.runs import load_config
+from sofnn_torch.session import build
 from sofnn_torch.training import RunOptions, play
-
-
-def parts(config):
-    agent, env = make_agent(config), make_env(config)
-    env.reset(seed=training.environment_seed(config))
-    return agent, env
 
 
 def end_of(run):
@@ -38,7 +34,7 @@ def rows_of(run):
 
 @pytest.mark.parametrize("agent", ["sga", "q"])
 def test_a_trial_is_recorded_as_it_was(agent):
-    learner, env = parts(settings(agent))
+    learner, env = build(settings(agent))
     steps, rewards, bumps = [], [], []
     real = env.step
 
@@ -62,7 +58,7 @@ def test_a_trial_is_recorded_as_it_was(agent):
 
 
 def test_a_heading_error_is_taken_the_short_way_round():
-    learner, env = parts(settings())
+    learner, env = build(settings())
     real = env.step
 
     def step(action):
@@ -79,7 +75,7 @@ def test_a_heading_error_is_taken_the_short_way_round():
 @pytest.mark.parametrize("agent", ["sga", "q"])
 @pytest.mark.parametrize("explore", [False, True])
 def test_a_trial_without_learning_changes_nothing_but_random_numbers(agent, explore):
-    learner, env = parts(settings(agent))
+    learner, env = build(settings(agent))
     play(env, learner)
     before = checkpoint.snapshot(learner, env)["agent"]
     record, _ = play(env, learner, learn=False, explore=explore)
@@ -94,7 +90,7 @@ def test_a_trial_without_learning_changes_nothing_but_random_numbers(agent, expl
 def test_the_table_holds_every_trial_to_the_last_bit(options):
     config = settings(trials=3)
     run = training.train(config, options)
-    agent, env = parts(config)
+    agent, env = build(config)
     rows = rows_of(run)
     assert [int(row["trial"]) for row in rows] == [1, 2, 3]
     for row in rows:
@@ -125,7 +121,7 @@ def test_other_seeds_give_other_runs(agent, options):
 
 
 def test_learner_and_maze_draw_different_numbers():
-    agent, env = parts(settings())
+    agent, env = build(settings())
     assert agent.rng.random(4).tolist() != env.unwrapped.np_random.random(4).tolist()
 
 
@@ -148,6 +144,15 @@ def test_the_number_of_threads_has_no_influence(agent, tmp_path, same_run):
     ]
     torch.set_num_threads(1)
     same_run(*runs)
+
+
+def test_a_resume_with_other_threads_says_so(options, capsys):
+    run = training.train(settings(trials=2), options)
+    training.resume(run, dataclasses.replace(options, threads=2), trials=3)
+    torch.set_num_threads(1)
+    assert "threads was 1, is 2" in capsys.readouterr().err
+    earlier = json.loads((run / "config.json").read_text())["earlier"]
+    assert [session["versions"]["threads"] for session in earlier] == ["1"]
 
 
 def test_more_trials_go_on_as_one_longer_run(tmp_path):

@@ -1,0 +1,61 @@
+"""A file that TensorBoard reads.
+
+In contrast to torch's ``SummaryWriter`` it is written by the caller's own thread: what was added is
+in the file when `flush` returns, and a disk that refuses is an `OSError` for the caller and not
+the death of a thread.
+"""
+
+import os
+import socket
+import time
+from pathlib import Path
+
+from tensorboard.compat.proto.event_pb2 import Event, SessionLog
+from tensorboard.compat.proto.summary_pb2 import Summary
+from tensorboard.summary.writer.record_writer import RecordWriter
+
+
+class EventFile:
+    """One event file in a run directory.
+
+    Args:
+        directory: the run directory.
+        first_step: step of what comes next; TensorBoard drops what earlier files of the
+            directory hold from this step on.
+
+    Raises:
+        OSError: the file cannot be made.
+    """
+
+    def __init__(self, directory: Path, first_step: int):
+        # Files are read in the order of their names; seconds alone would not order them.
+        name = f"events.out.tfevents.{time.time():.6f}.{socket.gethostname()}.{os.getpid()}"
+        self.path = Path(directory) / name
+        self._records = RecordWriter(open(self.path, "xb"))  # noqa: SIM115
+        self._add(Event(file_version="brain.Event:2"), 0)
+        self._add(Event(session_log=SessionLog(status=SessionLog.START)), first_step)
+        self.flush()
+
+    def add(self, summary: Summary, step: int = 0) -> None:
+        """Append a summary at a step.
+
+        Raises:
+            OSError: the disk refused; the file is damaged from here on, begin another one.
+        """
+        self._add(Event(summary=summary), step)
+
+    def flush(self) -> None:
+        """Hand everything to the operating system.
+
+        Raises:
+            OSError: as `add`.
+        """
+        self._records.flush()
+
+    def close(self) -> None:
+        """Flush and close the file."""
+        self._records.close()
+
+    def _add(self, event: Event, step: int) -> None:
+        event.step, event.wall_time = step, time.time()
+        self._records.write(event.SerializeToString())

@@ -1,0 +1,1 @@
+"""Studies over many seeds: what is run, the data, the tables and the figures."""

@@ -1,0 +1,147 @@
+"""Pages in Markdown, with figures, from the data of the studies: nothing here needs the runs."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sofnn_torch.reproduce import drawing
+from sofnn_torch.reproduce.claims import HOW, claims, closing_table, goals
+from sofnn_torch.reproduce.results import Data, cell, learned_after, markdown, mean, median, read
+from sofnn_torch.reproduce.studies import STUDIES
+from sofnn_torch.runs import say
+
+NOTES = """\
+Cells are medians over the seeds, with the 95 % interval of a percentile bootstrap over seeds in
+brackets; success is the mean over the seeds. The policy learned is played for {episodes} trials
+without learning: *greedy* is the mean action (SGA) or the best one (Q), *sampled* the stochastic
+policy of the training. A trial that fails counts with its {limit:,} steps. *Trials to learn* is
+the trial that completes the first {in_a_row} in a row under {within} times the optimum (in
+training, so exploration included); a run where that never happens counts as more than its number
+of trials. The kinematic optimum of the maze is {optimum} steps
+(`python -m sofnn_torch.optimum`)."""
+
+
+CONDITION_NOTES = """\
+Greedy policy, 10 trials for each seed; mean success and median steps over the seeds, with 95 %
+intervals. The robot is told the pose that it starts from, scattered or not, as at every pass of
+the start. The sampled policy is in the data."""
+
+
+def arm_table(data: Data) -> str:
+    """The main table of a study."""
+    changes = any(arm["changes"] for arm in data.info["arms"].values())
+    head = ["arm", *["change"] * changes, "seeds", "trials to learn", "success, greedy [%]"]
+    head += ["steps, greedy", "over the optimum", "success, sampled [%]", "steps, sampled"]
+    head += ["collisions a trial", "rules", "steps of training [1000]"]
+    rows = []
+    for arm in data.arms():
+        column = {k: data.column(arm, k) for k in data.rows[0] if k not in ("arm", "status")}
+        change = data.info["arms"][arm]["changes"]
+        steps = median(column["greedy_steps"])
+        row = [arm, *[f"`{change}`" if change else ""] * changes, str(len(column["seed"]))]
+        row += [
+            cell(learned_after(data, arm), limit=column["trials"][0]),
+            cell(mean(column["greedy_success"]), 1, 100),
+            cell(steps),
+            cell(steps, 2, 1 / data.info["optimum"]),
+            cell(mean(column["sampled_success"]), 1, 100),
+            cell(median(column["sampled_steps"])),
+            cell(median(column["sampled_collisions"]), 1),
+            cell(median(column["rules"])),
+            cell(median(column["total_steps"]), 0, 1e-3),
+        ]
+        rows.append(row)
+    return markdown(head, rows)
+
+
+def provenance(info: dict[str, Any]) -> str:
+    """With what a study was made, and how long it took."""
+    commits = ", ".join(f"`{commit}`" for commit in info["commits"])
+    versions = "; ".join(
+        ", ".join(f"{name} {version}" for name, version in made.items())
+        for made in info["versions"]
+    )
+    hours = info["wall_seconds"] / 3600, info["cpu_seconds"] / 3600
+    return (
+        f"Made with `{info['command']}`; number of runs: {info['runs']}, together {hours[0]:.2f} "
+        f"hours of wall time and {hours[1]:.2f} of processor time. Commit: {commits}. "
+        f"Versions: {versions}. Settings and seeds of every arm: "
+        f"[{info['study']}.json]({info['study']}.json); a line for each run: "
+        f"[{info['study']}.csv]({info['study']}.csv)."
+    )
+
+
+def page(out: Path, data: Data) -> str:
+    """The page of a study; its figures are drawn into the directory."""
+    info, study = data.info, STUDIES[data.info["study"]]
+    limit = max(arm["config"]["maze"]["max_steps"] for arm in info["arms"].values())
+    parts = [f"# {info['title']}", info["about"]]
+    if info["quick"]:
+        parts.append("**A quick look with short runs: the numbers mean nothing.**")
+    if study.figures:
+        parts += ["## Beside the paper's numbers"]
+        parts += [markdown(["", "paper", "here", "over the optimum"], closing_table(data))]
+        parts += ["## The paper's claims"]
+        parts += [markdown(["claim", "criterion", "measured", "verdict"], claims(data)), HOW]
+        parts += ["## What was to be reached (greedy policy)"]
+        parts += [markdown(["learner", "goal", "measured", "reached"], goals(data))]
+    if study.conditions and "conditions" in data.tables:
+        parts += ["## In other conditions", condition_table(data), CONDITION_NOTES]
+    if captions := drawing.draw(out, data):
+        parts += ["## Figures", *(f"![{text}]({name}.png)\n\n*{text}*" for name, text in captions)]
+    parts += ["## All arms", arm_table(data), NOTES.format(limit=limit, **info)]
+    return "\n\n".join(part.strip() for part in [*parts, "## Provenance", provenance(info)]) + "\n"
+
+
+def condition_table(data: Data) -> str:
+    """Success and steps of every arm in every condition."""
+    rows = data.tables["conditions"]
+    conditions = list(dict.fromkeys((row["group"], row["value"]) for row in rows))
+    arms = data.arms()
+    head = [
+        "condition",
+        *(f"{arm}, {quantity}" for arm in arms for quantity in ("success", "steps")),
+    ]
+    lines = []
+    for group, value in conditions:
+        line = [group.replace("[", f"{value:g} [")]
+        for arm in arms:
+            chosen = [
+                row
+                for row in rows
+                if (row["arm"], row["group"], row["value"]) == (arm, group, value)
+                and row["policy"] == "greedy"
+            ]
+            success, steps = (np.array([row[q] for row in chosen]) for q in ("success", "steps"))
+            line += [f"{cell(mean(success), 0, 100)} %", cell(median(steps))]
+        lines.append(line)
+    return markdown(head, lines)
+
+
+def write(out: Path) -> int:
+    """Write the page of every study that has data in a directory, and the index; the exit code.
+
+    Raises:
+        ValueError: there is no data.
+    """
+    names = [name for name in STUDIES if (out / f"{name}.csv").exists()]
+    if not names:
+        raise ValueError(f"{out}: no data of a study; run one first")
+    index = []
+    for name in names:
+        data = read(out, name)
+        (out / f"{name}.md").write_text(page(out, data))
+        seeds = sorted({len(arm["seeds"]) for arm in data.info["arms"].values()})
+        count = "-".join(map(str, seeds[:: max(1, len(seeds) - 1)]))
+        link = f"[{data.info['title']}]({name}.md)"
+        index.append([link, str(len(data.info["arms"])), count, f"`{data.info['command']}`"])
+    text = (
+        "# Results\n\nEvery table and figure here is written by a command, from the data beside "
+        "it. `python -m sofnn_torch.reproduce --report-only` writes them anew without running "
+        "anything.\n\n"
+    )
+    text += markdown(["study", "arms", "seeds of an arm", "command"], index)
+    (out / "README.md").write_text(text + "\n")
+    say(f"written: {out}/README.md and the pages of {', '.join(names)}")
+    return 0

@@ -1,0 +1,157 @@
+"""The data of a study in memory, statistics over its seeds, and tables in Markdown."""
+
+import csv
+import io
+import json
+import math
+import warnings
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from sofnn_torch.evaluate import CONFIDENCE, Estimate
+
+
+@dataclass(frozen=True)
+class Data:
+    """The data of one study: the summary, a row for each run, and the other tables by name."""
+
+    info: dict[str, Any]
+    rows: list[dict[str, Any]]
+    tables: dict[str, list[dict[str, Any]]]
+
+    def arms(self) -> list[str]:
+        """The arms that have finished runs, those of equal settings but once."""
+        seen: list[Any] = []
+        names = []
+        for name, arm in self.info["arms"].items():
+            if (same := [arm["config"], arm["seeds"]]) not in seen:
+                seen.append(same)
+                names.append(name)
+        return names
+
+    def column(self, arm: str, column: str) -> NDArray[np.float64]:
+        """A column over the seeds of an arm; empty if the arm has no run."""
+        return np.array([row[column] for row in self.rows if row["arm"] == arm], float)
+
+    def curves(self, arm: str, quantity: str) -> list[NDArray[np.float64]]:
+        """A quantity of every trial, for each seed of an arm."""
+        rows = self.tables.get("curves", [])
+        chosen = [row for row in rows if (row["arm"], row["quantity"]) == (arm, quantity)]
+        return [np.array(str(row["values"]).split(), float) for row in chosen]
+
+
+def read(out: Path, name: str) -> Data:
+    """The data of a study in a directory."""
+    parts = ("curves", "paths", "conditions")
+    files = {part: out / f"{name}-{part}.csv" for part in parts}
+    tables = {part: read_table(file) for part, file in files.items() if file.exists()}
+    info = json.loads((out / f"{name}.json").read_text())
+    return Data(info, read_table(out / f"{name}.csv"), tables)
+
+
+def read_table(path: Path) -> list[dict[str, Any]]:
+    """Rows of a CSV file; what looks like a number is one."""
+    with open(path, newline="") as file:
+        return [{k: _number(v) for k, v in row.items()} for row in csv.DictReader(file)]
+
+
+def _number(text: str) -> Any:
+    try:
+        return float(text)
+    except ValueError:
+        return text
+
+
+def write_table(path: Path, rows: Sequence[dict[str, Any]]) -> None:
+    """Rows of equal columns as CSV."""
+    buffer = io.StringIO()
+    writer = csv.DictWriter(buffer, rows[0].keys(), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    path.write_text(buffer.getvalue())
+
+
+# ------------------------------------------------------------------------------- statistics
+
+
+def bootstrap(
+    samples: Sequence[NDArray[Any]], statistic: Callable[..., Any], seed: int = 0
+) -> Estimate:
+    """A statistic of independent samples with its percentile interval; NaN if one is empty."""
+    if not all(map(len, samples)):
+        return Estimate(math.nan, math.nan, math.nan)
+    value = float(statistic(*samples))
+    if all(len(sample) == 1 for sample in samples):
+        return Estimate(value, math.nan, math.nan)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # equal values make a degenerate distribution
+        interval = stats.bootstrap(
+            # SciPy refuses samples of one, which say nothing of spread; doubled they are the same.
+            [np.repeat(s, 2) if len(s) == 1 else s for s in samples],
+            statistic,
+            paired=False,
+            method="percentile",
+            confidence_level=CONFIDENCE,
+            rng=np.random.default_rng(seed),
+        ).confidence_interval
+    return Estimate(value, float(interval.low), float(interval.high))
+
+
+def median(values: NDArray[Any]) -> Estimate:
+    """Median with its interval."""
+    return bootstrap([values], np.median)
+
+
+def mean(values: NDArray[Any]) -> Estimate:
+    """Mean with its interval."""
+    return bootstrap([values], np.mean)
+
+
+def ratio(above: NDArray[Any], below: NDArray[Any]) -> Estimate:
+    """Ratio of two medians with its interval."""
+
+    def statistic(a: NDArray[Any], b: NDArray[Any], axis: int = -1) -> Any:
+        return np.median(a, axis=axis) / np.median(b, axis=axis)
+
+    return bootstrap([above, below], statistic)
+
+
+def learned_after(data: Data, arm: str) -> Estimate:
+    """Median trials to learn; runs that never learn count as one more than their trials."""
+    return median(censored(data, arm))
+
+
+def censored(data: Data, arm: str) -> NDArray[np.float64]:
+    """Trials to learn with one more than all trials for never: medians stay what they are."""
+    values, limits = data.column(arm, "trials_to_learn"), data.column(arm, "trials")
+    return np.where(np.isnan(values), limits + 1, values)
+
+
+# --------------------------------------------------------------------------------- Markdown
+
+
+def markdown(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A table; all columns but the first are flushed right."""
+    lines = [head, ["---", *["---:"] * (len(head) - 1)], *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def cell(estimate: Estimate, digits: int = 0, factor: float = 1, limit: float = math.inf) -> str:
+    """An estimate with its interval; above the limit it is only known to be more."""
+
+    def show(value: float) -> str:
+        if factor * value > limit:
+            return f"> {limit:,.{digits}f}"
+        return f"{factor * value:,.{digits}f}"
+
+    if math.isnan(estimate.value):
+        return "-"
+    if math.isnan(estimate.low):
+        return show(estimate.value)
+    return f"{show(estimate.value)} ({show(estimate.low)} to {show(estimate.high)})"
