@@ -112,9 +112,9 @@ class QConfig:
     """Bound of the consequents' traces; None for no bound."""
     rate_state: float = 0.0
     """Learning rate of c_x."""
-    rate_action: float = 0.3
+    rate_action: float = 0.5
     """Learning rate of c_a."""
-    rate_constant: float = 0.7
+    rate_constant: float = 0.5
     """Learning rate of c."""
     rate_centre: float = 0.0
     """Learning rate of the centres u; 0 leaves them where they were put."""
@@ -198,7 +198,9 @@ def preset(agent: str, network: str, name: str) -> Config:
         raise ValueError(f"no preset {name!r} for agent {agent!r}")
     if name == "paper":
         return _paper(agent, network)
-    net = NetworkConfig(theta=0.4 if agent == "sga" else 0.3)
+    net = NetworkConfig()
+    if agent == "q":  # greedy action values need sharper sets: wide ones reach through walls
+        net = NetworkConfig(theta=0.3, width_position=0.045, width_heading=0.4)
     if network == "fixed":  # half the grid's spacing
         net = dataclasses.replace(net, width_position=0.042, width_heading=0.39)
     if agent == "sga":

@@ -2,6 +2,7 @@
 
 import dataclasses
 import io
+import itertools
 import json
 import math
 import sys
@@ -24,7 +25,6 @@ from sofnn_torch.reproduce import (
     results,
     robustness,
     running,
-    studies,
 )
 from sofnn_torch.reproduce.studies import STUDIES, Times, changed, essence, settings
 
@@ -66,7 +66,7 @@ def test_a_factor_follows_the_preset():
 
 @pytest.mark.parametrize("name", ["net.thetta", "theta", "preset.theta"])
 def test_a_change_of_no_setting_is_refused(name):
-    with pytest.raises((ValueError, AttributeError), match="preset|theta"):
+    with pytest.raises((ValueError, AttributeError), match=r"preset|theta"):
         settings({"agent": "q", name: 1.0})
 
 
@@ -225,6 +225,210 @@ def test_the_scattered_start_is_near_the_start_and_seeded():
     assert (offset <= 0.5 * np.array(robustness.START_SPREAD) + 1e-9).all()
     assert (offset.max(0) > 0.3 * np.array(robustness.START_SPREAD)).all()
     assert (starts[0] == starts[1]).all() and (starts[0] != starts[2]).any()
-    noisy = robustness.changed_maze(config, {"motor_noise": 0.3, "wheel_base_scale": 1.03}, 0)
-    assert noisy.unwrapped.noise.level == 0.3 and noisy.unwrapped.maze is not None
+    noisy = robustness.changed_maze(config, {"motor_noise": 0.3}, 0)
+    assert noisy.unwrapped.noise.magnitude == 0.3
     noisy.close()
+
+
+# ------------------------------------------------------------------- statistics and the report
+
+
+def test_medians_come_with_intervals_that_contain_them():
+    data = np.random.default_rng(0).normal(500, 30, 40)
+    middle = results.median(data)
+    assert middle.value == np.median(data)
+    assert data.min() < middle.low < middle.value < middle.high < data.max()
+    assert results.median(data) == middle  # seeded
+    assert middle.high - middle.low > 2 * (results.median(np.tile(data, 25)).high - middle.value)
+    assert dataclasses.astuple(results.median(np.full(5, 7.0))) == (7, 7, 7)
+    alone = results.median(np.array([3.0]))
+    assert alone.value == 3 and math.isnan(alone.low)
+    assert math.isnan(results.median(np.zeros(0)).value)
+    half = results.ratio(data, 2 * data)
+    assert half.value == 0.5 and half.low < 0.5 < half.high
+
+
+@pytest.mark.parametrize(
+    ("estimate", "text"),
+    [
+        ((1234.5, 1000, 2000), "1,234 (1,000 to 2,000)"),
+        ((151, 80, 151), "> 150 (80 to > 150)"),
+        ((151, math.nan, math.nan), "> 150"),
+        ((math.nan, math.nan, math.nan), "-"),
+    ],
+)
+def test_cells(estimate, text):
+    limit = math.inf if "1,234" in text else 150
+    assert results.cell(evaluate.Estimate(*estimate), limit=limit) == text
+
+
+@pytest.mark.parametrize(
+    ("interval", "verdict"),
+    [
+        ((0.6, 0.9), claims.HOLDS),
+        ((0.1, 0.4), claims.FAILS),
+        ((0.4, 0.6), claims.OPEN),
+        ((math.nan, math.nan), claims.OPEN),
+    ],
+)
+def test_verdicts_are_of_whole_intervals(interval, verdict):
+    assert claims.judge(evaluate.Estimate(0.5, *interval), 0.5, 1) == verdict
+
+
+LEVEL = {"sga-sofnn": 500, "q-sofnn": 520, "sga-fixed": 560, "q-fixed": 20_000}  # steps at the end
+
+
+def fake(out, name, trials=40, seeds=10):
+    """Data of a study as `collect` writes them, of learners that end at LEVEL."""
+    rng, tables = np.random.default_rng(5), {"": [], "curves": [], "paths": [], "conditions": []}
+    plan = drawing.Physics().plan
+    for arm in STUDIES[name].arms:
+        level = LEVEL[arm.rsplit("-", 1)[0]]
+        for seed in range(seeds):
+            key = {"arm": arm, "seed": seed}
+            curve = level + 10_000 * 0.8 ** np.arange(trials) * rng.uniform(0.5, 1, trials)
+            steps = np.minimum(curve.round(), 20_000)
+            row = {"status": "done", "trials": trials}
+            row["trials_to_learn"] = collecting.trials_to_learn(steps, steps < 20_000, OPTIMUM)
+            for policy in ("greedy", "sampled"):
+                row[f"{policy}_success"] = float(level < 20_000)
+                row[f"{policy}_steps"] = level + rng.normal(0, 10) * (level < 20_000)
+                row[f"{policy}_collisions"] = 0.5
+            row |= {"rules": (800, 1152)["fixed" in arm] + ("sofnn-e" in arm) * seed}
+            tables[""].append(
+                key | row | {"total_steps": 1e5, "wall_seconds": 60, "cpu_seconds": 50}
+            )
+            for quantity, values in (("steps", steps), ("rules", np.full(trials, row["rules"]))):
+                text = " ".join(f"{value:.0f}" for value in values)
+                tables["curves"].append(key | {"quantity": quantity, "values": text})
+            if level < 20_000:
+                tables["paths"] += fake_path(key, plan, rng)
+            for group, values in robustness.CONDITIONS.items():
+                for value in values:
+                    common = {"group": group, "value": value, "success": 1 - abs(value) / 200}
+                    common |= {"steps": level * (1 + abs(value) / 100), "collisions": 1}
+                    tables["conditions"] += [
+                        key | common | {"policy": policy} for policy in ("greedy", "sampled")
+                    ]
+    wanted = {"": True, "curves": True}
+    wanted |= {"paths": STUDIES[name].figures, "conditions": STUDIES[name].conditions}
+    for part, rows in tables.items():
+        if wanted[part]:
+            results.write_table(out / f"{name}{'-' * bool(part)}{part}.csv", rows)
+    arms = {
+        arm: {
+            "changes": changed(entries),
+            "seeds": [*range(seeds)],
+            "config": dataclasses.asdict(settings(entries)),
+        }
+        for arm, entries in STUDIES[name].arms.items()
+    }
+    summary = {"study": name, "title": STUDIES[name].title, "about": STUDIES[name].about}
+    summary |= {"command": "the command", "quick": False, "optimum": OPTIMUM, "episodes": 10}
+    summary |= {"in_a_row": 10, "within": 1.5, "runs": 3, "wall_seconds": 1, "cpu_seconds": 1}
+    summary |= {"commits": ["abc"], "versions": [{"torch": "2"}], "arms": arms}
+    (out / f"{name}.json").write_text(json.dumps(summary))
+
+
+def fake_path(key, plan, rng):
+    """Points through the sub-goals, with an error that grows until each of them."""
+    corners = np.array([plan.start[:2], *plan.subgoals, plan.goal])
+    points = np.concatenate([np.linspace(a, b, 15)[:-1] for a, b in itertools.pairwise(corners)])
+    error = np.zeros(2)
+    for decision, point in enumerate(points):
+        near = any(np.hypot(*(point - goal)) < plan.subgoal_radius for goal in plan.subgoals)
+        error = np.zeros(2) if near else error + rng.normal(0, 0.002, 2)
+        values = [*point, 0.0, *(point + error), 0.0]
+        names = ["x", "y", "heading"]
+        names += [f"{name}_estimated" for name in names]
+        yield key | {"decision": decision} | dict(zip(names, np.round(values, 5), strict=True))
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    """A directory of results from fake data."""
+    out = tmp_path_factory.mktemp("results")
+    for name in ("section5", "robustness"):
+        fake(out, name)
+    assert report.write(out) == 0
+    return out
+
+
+def test_claims_and_goals_follow_the_data(written):
+    data = results.read(written, "section5")
+    verdicts = {claim: verdict for claim, _, _, verdict in claims.claims(data)}
+    expected = {
+        "SGA: the proposed": claims.HOLDS,
+        "SGA: the conventional": claims.FAILS,
+        "Q-learning: the proposed": claims.HOLDS,
+        "Q-learning: the conventional": claims.HOLDS,
+        "Q-learning grows many more": claims.FAILS,
+        "Fig. 10, SGA": claims.HOLDS,
+        "Fig. 11, Q-learning": claims.HOLDS,
+        "same performance": claims.HOLDS,
+    }
+    for part, verdict in expected.items():
+        assert [v for claim, v in verdicts.items() if part in claim] == [verdict], part
+    reached = {(who, goal): yes for who, goal, _, yes in claims.goals(data)}
+    assert reached["SGA", "steps at most 516"] == "yes"
+    assert reached["Q-learning", "steps within 1.10 of the optimum"] == "no"  # 520 / 468
+    text = (written / "section5.md").read_text()
+    assert "| Q-learning with FSFNN: rules | 9,216 | 1,152 |" in text
+    assert "| > 40 |" in text and " nan" not in text
+
+
+def test_every_figure_is_there_and_shown(written):
+    text = (written / "section5.md").read_text() + (written / "robustness.md").read_text()
+    names = [f"section5-fig{n}" for n in (7, 8, 9, 10, 11)] + ["robustness-conditions"]
+    for name in names:
+        picture = Image.open(io.BytesIO((written / f"figures/{name}.png").read_bytes()))
+        assert np.ptp(np.asarray(picture.convert("L"))) > 200
+        assert (written / f"figures/{name}.svg").read_text().startswith("<?xml")
+        assert f"](figures/{name}.png)" in text
+
+
+def test_a_report_can_be_written_again(written, monkeypatch, capsys):
+    before = {p.name: p.read_bytes() for p in written.rglob("*") if p.suffix in (".md", ".svg")}
+    monkeypatch.setattr(sys, "argv", ["reproduce", "--report-only", "--out", str(written)])
+    with pytest.raises(SystemExit) as stop:
+        command.main()
+    assert stop.value.code == 0
+    after = {p.name: p.read_bytes() for p in written.rglob("*") if p.suffix in (".md", ".svg")}
+    assert before == after
+
+
+def test_data_of_runs_become_a_page(tmp_path, monkeypatch):
+    runs, out = tmp_path / "runs", tmp_path / "out"
+    monkeypatch.setattr(
+        command, "optimal_steps", lambda plan: dataclasses.make_dataclass("O", ["steps"])(OPTIMUM)
+    )
+    options = {"study": ("growth",), "arms": "sga-rule", "seeds": "0-1", "trials": 2}
+    options |= {"max_steps": 30, "runs": runs, "out": out}
+    for work in running.plan(
+        runs, ["growth"], "sga-rule", [0, 1], {"trials": 2, "maze.max_steps": 30}
+    ):
+        assert done(work) == 0
+    assert command.run(command.Options(**options)) == 0
+    data = results.read(out, "growth")
+    assert data.column("sga-rule", "seed").tolist() == [0, 1]
+    assert data.column("sga-rule", "total_steps").tolist() == [60, 60]
+    assert [curve.tolist() for curve in data.curves("sga-rule", "steps")] == [[30, 30]] * 2
+    assert data.info["arms"]["sga-rule"]["config"]["maze"]["max_steps"] == 30
+    assert data.info["command"].endswith("--study growth --seeds 0-1 --trials 2 --max-steps 30")
+    assert "| sga-rule |" in (out / "growth.md").read_text()
+    assert "growth.md" in (out / "README.md").read_text()
+
+
+@pytest.mark.parametrize(
+    "words",
+    ["--study nothing", "--workers 0", "--seeds x", "--arms nonesuch", "--report-only --out empty"],
+)
+def test_bad_options_are_one_line(words, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["reproduce", *words.split()])
+    with pytest.raises(SystemExit) as stop:
+        command.main()
+    assert stop.value.code == 2
+    message = capsys.readouterr().err
+    assert message.startswith("error: ") and message.count("\n") == 1
+    assert not list(tmp_path.iterdir())

@@ -6,7 +6,7 @@ import numpy as np
 
 from sofnn_torch.evaluate import Estimate, proportion
 from sofnn_torch.physics import Physics
-from sofnn_torch.reproduce.drawing import AGENTS, last_paths
+from sofnn_torch.reproduce.drawing import AGENTS, NETWORKS, last_paths
 from sofnn_torch.reproduce.results import Data, cell, censored, learned_after, mean, median, ratio
 
 HOLDS, FAILS, OPEN = "holds", "does not hold", "cannot tell"
@@ -139,12 +139,7 @@ def closing_table(data: Data) -> Iterator[tuple[str, ...]]:
         for network, count in zip(("sofnn", "fixed"), rules, strict=True):
             if (arm := f"{agent}-{network}-estimated") in data.info["arms"]:
                 ours = cell(median(data.column(arm, "rules")))
-                yield f"{title} with {network_name(network)}: rules", f"{count:,}", ours, ""
-
-
-def network_name(network: str) -> str:
-    """The paper's name of a network."""
-    return {"sofnn": "SOFNN", "fixed": "FSFNN"}[network]
+                yield f"{title} with {NETWORKS[network]}: rules", f"{count:,}", ours, ""
 
 
 def goals(data: Data) -> Iterator[tuple[str, str, str, str]]:

@@ -20,10 +20,8 @@ from sofnn_torch.runs import say
 
 AGENTS = {"sga": "SGA", "q": "Q-learning"}
 NETWORKS = {"sofnn": "SOFNN", "fixed": "FSFNN"}
-BAND = (
-    "Line: median over the seeds; band: interquartile range; faint: each seed. "
-    "A trial that ends without the goal counts with its limit."
-)
+BAND = "Line: median over the seeds; band: interquartile range; faint: each seed."
+LIMIT = "A trial that ends without the goal counts with its limit."
 Caption = tuple[str, str]  # file without suffix, text
 
 
@@ -41,34 +39,37 @@ def draw(out: Path, data: Data) -> list[Caption]:
     for number, figure, text in _figures(data):
         folder.mkdir(exist_ok=True)
         name = f"{data.info['study']}-{number}"
-        save(figure, folder / name)
-        captions.append((f"figures/{name}", text))
+        if figure is not None:
+            save(figure, folder / name)
+        if (folder / f"{name}.png").exists():
+            captions.append((f"figures/{name}", text))
     return captions
 
 
-def _figures(data: Data) -> Iterator[tuple[str, Figure, str]]:
+def _figures(data: Data) -> Iterator[tuple[str, Figure | None, str]]:
     study = STUDIES[data.info["study"]]
     if study.figures:
         yield from _of_the_paper(data)
     if study.conditions and "conditions" in data.tables:
         text = (
-            "Success (mean over the seeds) and steps (median and interquartile band; a trial that "
-            "fails counts with its limit) of the greedy policy in changed conditions."
+            "Robustness: success (mean over the seeds) and steps (median and interquartile band; a "
+            "trial that fails counts with its limit) of the greedy policy in changed conditions."
         )
         yield "conditions", robustness(data), text
 
 
-def _of_the_paper(data: Data) -> Iterator[tuple[str, Figure, str]]:
+def _of_the_paper(data: Data) -> Iterator[tuple[str, Figure | None, str]]:
     plan = Physics().plan
-    if figure := maze(plan):
-        yield "fig6", figure, "Fig. 6: the maze, as rendered and as a plan."
+    yield "fig6", maze(plan), "Fig. 6: the maze, as rendered and as a plan."
     optimum = ("kinematic optimum", data.info["optimum"])
     for number, agent in ((7, "sga"), (8, "q")):
         arms = _curves(data, {t: f"{agent}-{n}-estimated" for n, t in NETWORKS.items()}, "steps")
         if arms:
             figure, (ax,) = figures.canvas(width=5, height=3.3)
             figures.learning_curves(arms, ax, reference=optimum)
-            text = f"Fig. {number}: steps to the goal, {AGENTS[agent]}, estimated pose. {BAND}"
+            text = (
+                f"Fig. {number}: steps to the goal, {AGENTS[agent]}, estimated pose. {BAND} {LIMIT}"
+            )
             yield f"fig{number}", figure, text
     names = {
         f"{AGENTS[agent]}, {text}": f"{agent}-{network}-estimated"
@@ -91,7 +92,11 @@ def _of_the_paper(data: Data) -> Iterator[tuple[str, Figure, str]]:
             figures.learning_curves(arms, ax, reference=optimum)
             ax.set_title(f"{AGENTS[agent]}, SOFNN")
         axes[1].sharey(axes[0])
-        yield "fig10", figure, f"Fig. 10: steps to the goal with estimated and true pose. {BAND}"
+        yield (
+            "fig10",
+            figure,
+            f"Fig. 10: steps to the goal with estimated and true pose. {BAND} {LIMIT}",
+        )
     paths = {agent: last_paths(data, f"{agent}-sofnn-estimated") for agent in AGENTS}
     if any(paths.values()):
         figure, axes = figures.canvas(2, width=3.8, height=3)
@@ -160,6 +165,11 @@ def pose_errors(paths: dict[int, Trajectory], ax: Axes, plan: MazePlan) -> None:
     ax.set(xlim=(0, max(map(len, errors)) - 1), ylim=(0, 1.05 * max(map(np.max, errors)) + 0.1))
 
 
+def _name(arm: str) -> str:
+    agent, network, _ = arm.split("-")
+    return f"{AGENTS[agent]}, {NETWORKS[network]}"
+
+
 @figures.styled
 def robustness(data: Data, policy: str = "greedy") -> Figure:
     """Success and steps of each learner against the size of each change."""
@@ -186,7 +196,7 @@ def robustness(data: Data, policy: str = "greedy") -> Figure:
                 else:
                     ax.fill_between(values, low, high, color=colour, alpha=0.15, linewidth=0)
                 style = {"marker": marker, "markersize": 3.5, "linewidth": 1.2}
-                ax.plot(values, middle, color=colour, linestyle=line, label=arm, **style)
+                ax.plot(values, middle, color=colour, linestyle=line, label=_name(arm), **style)
         axes[1, column].set_xlabel(group.replace(" [", "\n["))
     axes[0, 0].set(ylabel="success [%]", ylim=(-3, 103))
     axes[1, 0].set(ylabel="steps, all trials", yscale="log")

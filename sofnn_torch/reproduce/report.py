@@ -1,5 +1,6 @@
 """Pages in Markdown, with figures, from the data of the studies: nothing here needs the runs."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -7,7 +8,17 @@ import numpy as np
 
 from sofnn_torch.reproduce import drawing
 from sofnn_torch.reproduce.claims import HOW, claims, closing_table, goals
-from sofnn_torch.reproduce.results import Data, cell, learned_after, markdown, mean, median, read
+from sofnn_torch.reproduce.drawing import AGENTS
+from sofnn_torch.reproduce.results import (
+    Data,
+    cell,
+    learned_after,
+    markdown,
+    mean,
+    median,
+    ratio,
+    read,
+)
 from sofnn_torch.reproduce.studies import STUDIES
 from sofnn_torch.runs import say
 
@@ -28,31 +39,45 @@ intervals. The robot is told the pose that it starts from, scattered or not, as 
 the start. The sampled policy is in the data."""
 
 
-def arm_table(data: Data) -> str:
-    """The main table of a study."""
-    changes = any(arm["changes"] for arm in data.info["arms"].values())
+def arm_table(data: Data, arms: Sequence[str]) -> str:
+    """The main table of a study, for some of its arms."""
+    changes = any(data.info["arms"][arm]["changes"] for arm in arms)
+    base = next((arm for arm in arms if arm.endswith("-default")), None)
     head = ["arm", *["change"] * changes, "seeds", "trials to learn", "success, greedy [%]"]
-    head += ["steps, greedy", "over the optimum", "success, sampled [%]", "steps, sampled"]
-    head += ["collisions a trial", "rules", "steps of training [1000]"]
+    head += ["steps, greedy", "over the optimum", *["over the default"] * bool(base)]
+    head += ["success, sampled [%]", "steps, sampled", "collisions a trial", "rules"]
     rows = []
-    for arm in data.arms():
-        column = {k: data.column(arm, k) for k in data.rows[0] if k not in ("arm", "status")}
-        change = data.info["arms"][arm]["changes"]
-        steps = median(column["greedy_steps"])
-        row = [arm, *[f"`{change}`" if change else ""] * changes, str(len(column["seed"]))]
+    for arm in arms:
+        flags = data.info["arms"][arm]["changes"]
+        greedy = data.column(arm, "greedy_steps")
+        row = [arm, *[f"`{flags}`" if flags else ""] * changes, str(len(greedy))]
         row += [
-            cell(learned_after(data, arm), limit=column["trials"][0]),
-            cell(mean(column["greedy_success"]), 1, 100),
-            cell(steps),
-            cell(steps, 2, 1 / data.info["optimum"]),
-            cell(mean(column["sampled_success"]), 1, 100),
-            cell(median(column["sampled_steps"])),
-            cell(median(column["sampled_collisions"]), 1),
-            cell(median(column["rules"])),
-            cell(median(column["total_steps"]), 0, 1e-3),
+            cell(learned_after(data, arm), limit=data.column(arm, "trials")[0]),
+            cell(mean(data.column(arm, "greedy_success")), 1, 100),
+            cell(median(greedy)),
+            cell(median(greedy), 2, 1 / data.info["optimum"]),
+        ]
+        if base:
+            compared = ratio(greedy, data.column(base, "greedy_steps"))
+            row.append(cell(compared, 2) if arm != base else "1")
+        row += [
+            cell(mean(data.column(arm, "sampled_success")), 1, 100),
+            cell(median(data.column(arm, "sampled_steps"))),
+            cell(median(data.column(arm, "sampled_collisions")), 1),
+            cell(median(data.column(arm, "rules"))),
         ]
         rows.append(row)
-    return markdown(head, rows)
+    return markdown(head, rows, 1 + changes)
+
+
+def arm_tables(data: Data) -> str:
+    """A table for each learner where arms vary the settings of one, else one for all."""
+    arms = data.arms()
+    if not any(arm.endswith("-default") for arm in arms):
+        return arm_table(data, arms)
+    own = {title: [a for a in arms if a.startswith(f"{k}-")] for k, title in AGENTS.items()}
+    parts = [f"### {title}\n\n{arm_table(data, names)}" for title, names in own.items() if names]
+    return "\n\n".join(parts)
 
 
 def provenance(info: dict[str, Any]) -> str:
@@ -83,14 +108,18 @@ def page(out: Path, data: Data) -> str:
         parts += ["## Beside the paper's numbers"]
         parts += [markdown(["", "paper", "here", "over the optimum"], closing_table(data))]
         parts += ["## The paper's claims"]
-        parts += [markdown(["claim", "criterion", "measured", "verdict"], claims(data)), HOW]
+        parts += [markdown(["claim", "criterion", "measured", "verdict"], claims(data), 4), HOW]
         parts += ["## What was to be reached (greedy policy)"]
-        parts += [markdown(["learner", "goal", "measured", "reached"], goals(data))]
+        parts += [markdown(["learner", "goal", "measured", "reached"], goals(data), 4)]
     if study.conditions and "conditions" in data.tables:
         parts += ["## In other conditions", condition_table(data), CONDITION_NOTES]
-    if captions := drawing.draw(out, data):
-        parts += ["## Figures", *(f"![{text}]({name}.png)\n\n*{text}*" for name, text in captions)]
-    parts += ["## All arms", arm_table(data), NOTES.format(limit=limit, **info)]
+    captions = drawing.draw(out, data)
+    if captions:
+        parts += [
+            "## Figures",
+            *(f"![{text.partition(':')[0]}]({name}.png)\n\n*{text}*" for name, text in captions),
+        ]
+    parts += ["## All arms", arm_tables(data), NOTES.format(limit=limit, **info)]
     return "\n\n".join(part.strip() for part in [*parts, "## Provenance", provenance(info)]) + "\n"
 
 
@@ -141,7 +170,7 @@ def write(out: Path) -> int:
         "it. `python -m sofnn_torch.reproduce --report-only` writes them anew without running "
         "anything.\n\n"
     )
-    text += markdown(["study", "arms", "seeds of an arm", "command"], index)
+    text += markdown(["study", "arms", "seeds of an arm", "command"], index, 4)
     (out / "README.md").write_text(text + "\n")
     say(f"written: {out}/README.md and the pages of {', '.join(names)}")
     return 0

@@ -136,9 +136,9 @@ def censored(data: Data, arm: str) -> NDArray[np.float64]:
 # --------------------------------------------------------------------------------- Markdown
 
 
-def markdown(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A table; all columns but the first are flushed right."""
-    lines = [head, ["---", *["---:"] * (len(head) - 1)], *rows]
+def markdown(head: Sequence[str], rows: Iterable[Sequence[str]], texts: int = 1) -> str:
+    """A table; the first columns are texts, the others numbers and flushed right."""
+    lines = [head, ["---"] * texts + ["---:"] * (len(head) - texts), *rows]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
@@ -152,6 +152,6 @@ def cell(estimate: Estimate, digits: int = 0, factor: float = 1, limit: float = 
 
     if math.isnan(estimate.value):
         return "-"
-    if math.isnan(estimate.low):
+    if math.isnan(estimate.low) or estimate.low == estimate.high:
         return show(estimate.value)
     return f"{show(estimate.value)} ({show(estimate.low)} to {show(estimate.high)})"

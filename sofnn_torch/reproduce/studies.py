@@ -90,7 +90,7 @@ HELPS: dict[str, dict[str, Arm]] = {
     "q": {
         "no-optimism": {"q.initial": 0.0},
         "no-optimism-step-cost": {"q.initial": 0.0, "maze.step_reward": -1.0},
-        "actions-independent": {"q.rate_action": 1.0, "q.rate_constant": 0.0},
+        "actions-independent": {"q.rate_action": Times(2.0), "q.rate_constant": 0.0},
         "no-trace-cut": {"q.trace_cut": False},
         "no-trace-limit": {"q.trace_limit": None},
         "interpolation": {"net.interpolate": True},
