@@ -55,7 +55,7 @@ class SignalTrap:
 
     def __exit__(self, *_: object) -> None:
         for number, handler in self._former.items():
-            signal.signal(number, handler)
+            signal.signal(number, handler or signal.SIG_DFL)  # None: not of Python
 
     def _note(self, number: int, _frame: object) -> None:
         self.number = number

@@ -93,7 +93,7 @@ def watch(
     child = subprocess.Popen(
         command, env=ENVIRONMENT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
     )
-    shown = 0
+    shown, told = 0, False
     while True:
         try:
             _, errors = child.communicate(timeout=0.5)
@@ -106,8 +106,9 @@ def watch(
             lines = errors.strip().splitlines()
             message = lines[-1] if lines and child.returncode >= 0 else "killed"
             return number, path, child.returncode, f"exit code {child.returncode} ({message})"
-        if trap.number:
+        if trap.number and not told:  # once: a second one could hit a child that has just saved
             child.send_signal(trap.number)
+            told = True
 
 
 def _trials(path: Path) -> int:

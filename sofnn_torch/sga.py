@@ -193,7 +193,7 @@ class SGA:
         self._log["mu"].append(mean.detach())
         self._log["sigma"].append(deviation.detach())
         self._log["firing"].append(net.max_firing)
-        return self._command(action.numpy())
+        return self._command(action.cpu().numpy())
 
     def _learn(self, error: float) -> None:
         """Equations 7 and 8 for the reinforcement error r - b, then the bounds of mu and sigma."""

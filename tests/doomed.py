@@ -43,7 +43,7 @@ def start(
 
 def finish(child: multiprocessing.Process) -> int:
     """Wait for a process; its exit code, negative for a signal."""
-    child.join(120)
+    child.join(600)
     assert child.exitcode is not None, "the process hangs"
     return child.exitcode
 

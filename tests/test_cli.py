@@ -275,6 +275,8 @@ def test_a_signal_stops_all_seeds_after_saving(here):
     child = subprocess.Popen(
         [sys.executable, "-m", "sofnn_torch.cli", *words],
         env=os.environ | {"PYTHONPATH": str(ROOT)},
+        stderr=subprocess.PIPE,
+        text=True,
     )
     run = Path("runs/sga-sofnn-estimated-s0")
     deadline = time.monotonic() + 60

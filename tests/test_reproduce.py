@@ -66,7 +66,7 @@ def test_a_factor_follows_the_preset():
 
 @pytest.mark.parametrize("name", ["net.thetta", "theta", "preset.theta"])
 def test_a_change_of_no_setting_is_refused(name):
-    with pytest.raises((ValueError, AttributeError), match=r"preset|theta"):
+    with pytest.raises(ValueError, match="is not a setting"):
         settings({"agent": "q", name: 1.0})
 
 
@@ -278,7 +278,7 @@ def test_verdicts_are_of_whole_intervals(interval, verdict):
 LEVEL = {"sga-sofnn": 500, "q-sofnn": 520, "sga-fixed": 560, "q-fixed": 20_000}  # steps at the end
 
 
-def fake(out, name, trials=40, seeds=10):
+def fake(out, name, trials=30, seeds=8):
     """Data of a study as `collect` writes them, of learners that end at LEVEL."""
     rng, tables = np.random.default_rng(5), {"": [], "curves": [], "paths": [], "conditions": []}
     plan = drawing.Physics().plan
@@ -374,7 +374,7 @@ def test_claims_and_goals_follow_the_data(written):
     assert reached["Q-learning", "steps within 1.10 of the optimum"] == "no"  # 520 / 468
     text = (written / "section5.md").read_text()
     assert "| Q-learning with FSFNN: rules | 9,216 | 1,152 |" in text
-    assert "| > 40 |" in text and " nan" not in text
+    assert "| > 30 |" in text and " nan" not in text
 
 
 def test_every_figure_is_there_and_shown(written):
@@ -387,14 +387,16 @@ def test_every_figure_is_there_and_shown(written):
         assert f"](figures/{name}.png)" in text
 
 
-def test_a_report_can_be_written_again(written, monkeypatch, capsys):
-    before = {p.name: p.read_bytes() for p in written.rglob("*") if p.suffix in (".md", ".svg")}
-    monkeypatch.setattr(sys, "argv", ["reproduce", "--report-only", "--out", str(written)])
+def test_a_report_can_be_written_again(written, tmp_path, monkeypatch):
+    for file in [*written.glob("robustness*.csv"), written / "robustness.json"]:
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+    monkeypatch.setattr(sys, "argv", ["reproduce", "--report-only", "--out", str(tmp_path)])
     with pytest.raises(SystemExit) as stop:
         command.main()
     assert stop.value.code == 0
-    after = {p.name: p.read_bytes() for p in written.rglob("*") if p.suffix in (".md", ".svg")}
-    assert before == after
+    for name in ("robustness.md", "figures/robustness-conditions.svg"):
+        assert (tmp_path / name).read_bytes() == (written / name).read_bytes()
+    assert "robustness.md" in (tmp_path / "README.md").read_text()
 
 
 def test_data_of_runs_become_a_page(tmp_path, monkeypatch):

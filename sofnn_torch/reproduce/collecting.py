@@ -58,7 +58,7 @@ def collect(
             tables[""].append(key | row)
             spans.append((path, row["wall_seconds"], row["cpu_seconds"]))
             source = json.loads((path / "config.json").read_text())
-            sources += [source, *source["earlier"]]
+            sources += [source, *source.get("earlier", [])]
             tables["curves"] += [key | curve for curve in _curves(path)]
             if study.figures:
                 tables["paths"] += [key | point for point in _path(path)]
@@ -108,9 +108,11 @@ def _row(path: Path, config: Config, optimum: int) -> dict[str, Any]:
         for quantity in ("success", "steps", "collisions"):
             values = [record[quantity] for record in records]
             row[f"{policy}_{quantity}"] = round(float(np.mean(values)), 4)
-    spent = np.loadtxt(path / "seconds.csv", delimiter=",", ndmin=2).sum(0)
+    wall = cpu = 0.0
+    if (path / "seconds.csv").exists():  # a sitting that was killed leaves no line
+        wall, cpu = np.loadtxt(path / "seconds.csv", delimiter=",", ndmin=2).sum(0).round(1)
     row |= {"rules": rules, "total_steps": total}
-    return row | {"wall_seconds": float(spent[0]), "cpu_seconds": float(spent[1])}
+    return row | {"wall_seconds": float(wall), "cpu_seconds": float(cpu)}
 
 
 def trials_to_learn(steps: Any, success: Any, optimum: float) -> float:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from sofnn_torch.reproduce import drawing
-from sofnn_torch.reproduce.claims import HOW, claims, closing_table, goals
+from sofnn_torch.reproduce.claims import HOW, arriving, claims, closing_table, goals
 from sofnn_torch.reproduce.drawing import AGENTS
 from sofnn_torch.reproduce.results import (
     Data,
@@ -24,15 +24,14 @@ from sofnn_torch.runs import say
 
 NOTES = """\
 Cells are medians over the seeds, with the 95 % interval of a percentile bootstrap over seeds in
-brackets; success is the mean over the seeds. The policy learned is played for {episodes} trials
-without learning: *greedy* is the mean action (SGA) or the best one (Q), *sampled* the stochastic
-policy of the training. A trial that fails counts with its {limit:,} steps. *Trials to learn* is
-the trial that completes the first {in_a_row} in a row under {within} times the optimum (in
-training, so exploration included); a run where that never happens counts as more than its number
-of trials. The kinematic optimum of the maze is {optimum} steps
+brackets; success is the mean over the seeds. *Arriving* is the number of seeds for which at least
+9 of the last 10 training trials ended at the goal. *Trials to learn* is the trial that completes
+the first {in_a_row} in a row under {within} times the optimum (in training, so exploration
+included); a run where that never happens counts as more than its number of trials. What was
+learned is then played for {episodes} trials without learning: *greedy* is the mean action (SGA) or
+the best one (Q), *sampled* the stochastic policy of the training. A trial that fails counts with
+its {limit:,} steps. The kinematic optimum of the maze is {optimum} steps
 (`python -m sofnn_torch.optimum`)."""
-
-
 CONDITION_NOTES = """\
 Greedy policy, 10 trials for each seed; mean success and median steps over the seeds, with 95 %
 intervals. The robot is told the pose that it starts from, scattered or not, as at every pass of
@@ -43,7 +42,14 @@ def arm_table(data: Data, arms: Sequence[str]) -> str:
     """The main table of a study, for some of its arms."""
     changes = any(data.info["arms"][arm]["changes"] for arm in arms)
     base = next((arm for arm in arms if arm.endswith("-default")), None)
-    head = ["arm", *["change"] * changes, "seeds", "trials to learn", "success, greedy [%]"]
+    head = [
+        "arm",
+        *["change"] * changes,
+        "seeds",
+        "arriving",
+        "trials to learn",
+        "success, greedy [%]",
+    ]
     head += ["steps, greedy", "over the optimum", *["over the default"] * bool(base)]
     head += ["success, sampled [%]", "steps, sampled", "collisions a trial", "rules"]
     rows = []
@@ -52,6 +58,7 @@ def arm_table(data: Data, arms: Sequence[str]) -> str:
         greedy = data.column(arm, "greedy_steps")
         row = [arm, *[f"`{flags}`" if flags else ""] * changes, str(len(greedy))]
         row += [
+            str(arriving(data, arm)[0]),
             cell(learned_after(data, arm), limit=data.column(arm, "trials")[0]),
             cell(mean(data.column(arm, "greedy_success")), 1, 100),
             cell(median(greedy)),
@@ -109,6 +116,8 @@ def page(out: Path, data: Data) -> str:
         parts += [markdown(["", "paper", "here", "over the optimum"], closing_table(data))]
         parts += ["## The paper's claims"]
         parts += [markdown(["claim", "criterion", "measured", "verdict"], claims(data), 4), HOW]
+        if (out / "fixed.csv").exists():
+            parts += ["What else was tried for FSFNN: [the search over its settings](fixed.md)."]
         parts += ["## What was to be reached (greedy policy)"]
         parts += [markdown(["learner", "goal", "measured", "reached"], goals(data), 4)]
     if study.conditions and "conditions" in data.tables:

@@ -97,7 +97,7 @@ HELPS: dict[str, dict[str, Arm]] = {
         "coding-wheels": {"q.coding": "wheels"},
         "coding-scalar": {"q.coding": "scalar"},
         "coding-antecedent": {"q.coding": "antecedent"},
-        "rate-times-0.1": {"q.rate_action": Times(0.1)},
+        "rates-times-0.1": {"q.rate_action": Times(0.1), "q.rate_constant": Times(0.1)},
         "lambda-0": {"q.trace_decay": 0.0},
         "lambda-0.5": {"q.trace_decay": 0.5},
         "lambda-0.95": {"q.trace_decay": 0.95},
@@ -195,15 +195,15 @@ def settings(arm: Arm, seed: int = 0, **changes: Any) -> Config:
     tables: dict[str, Arm] = {}
     for name, value in arm.items():
         table, _, entry = name.rpartition(".")
-        before = getattr(config, table) if table else config
-        if entry not in {known.name for known in dataclasses.fields(before)}:
+        before = getattr(config, table, None) if table else config
+        if not dataclasses.is_dataclass(before) or not hasattr(before, entry):
             raise ValueError(f"{name!r} is not a setting")
         if isinstance(value, Times):
             value = value.factor * getattr(before, entry)
         tables.setdefault(table, {})[entry] = value
-    top = tables.pop("", {})
+    top = {"seed": seed} | tables.pop("", {})
     parts = {name: dataclasses.replace(getattr(config, name), **t) for name, t in tables.items()}
-    return dataclasses.replace(config, seed=seed, **top, **parts)
+    return dataclasses.replace(config, **top, **parts)
 
 
 def changed(arm: Arm) -> str:
@@ -218,7 +218,7 @@ def changed(arm: Arm) -> str:
                 table, dot, entry = name.rpartition(".")
                 words.append(f"--{table}{dot}{'' if value else 'no-'}{entry}".replace("_", "-"))
                 continue
-            text = f"{value:.4g}" if isinstance(value, float) else str(value)
+            text = f"{value:.12g}" if isinstance(value, float) else str(value)
             text = " ".join(map(str, value)) if isinstance(value, list) else text
             words.append(f"--{name} {text}".replace("_", "-"))
     return " ".join(words)
