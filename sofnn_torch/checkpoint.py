@@ -172,7 +172,7 @@ def find_latest(directory: Path) -> tuple[Path, dict[str, Any], list[str]]:
         except CheckpointError as error:
             problems.append(str(error))
     reason = f" ({problems[0]})" if problems else ""
-    raise CheckpointError(f"{directory}: no checkpoint to go on from{reason}")
+    raise CheckpointError(f"{directory}: no checkpoint to go on from{reason}; train anew")
 
 
 def write_atomically(path: Path, data: bytes) -> None:

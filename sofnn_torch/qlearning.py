@@ -109,6 +109,7 @@ class QLearning:
         self.representatives = [-1.0, 0.0, 1.0] if actions == "three" else middles
         codes = [self._code(j, a) for j, a in enumerate(self.representatives)]
         self.codes = self.rates.new_tensor(codes)  # (J, length)
+        self.tails = torch.cat([self.codes, self.codes.new_ones(segments, 1)], 1)
         self.value = 0.0
         self._log = {"value": [], "error": [], "greedy": [], "firing": []}
 
@@ -127,7 +128,7 @@ class QLearning:
             self._learn(reward - self.value)
             return None
         firing = self._firing(x)
-        following = self.action_values(x, firing).max().item()
+        following = max(self.action_values(x, firing).tolist())
         self._learn(reward + self.gamma * following - self.value)
         return self._choose(x, self._firing(x) if self.antecedents else firing)
 
@@ -163,16 +164,14 @@ class QLearning:
         self.rng.bit_generator.state = state["rng"]
         self.value = state["value"]
 
-    @torch.no_grad()
     def action_values(self, x: Tensor, firing: Tensor) -> Tensor:
-        """Q(x, a_j) of every segment (eq. 10) from the firing (1, K) or (J, K). Shape: (J,)."""
-        conclusions = firing @ self.net.learnable(False).T  # (1 or J, m)
-        constant = x.new_ones(self.segments, 1)
-        features = torch.cat([x.expand(self.segments, -1), self.codes, constant], 1)  # (J, m)
+        """Q(x, a_j) of every segment (eq. 10) from the firing (.., K). Shape: (J,)."""
+        conclusions = firing @ self.net.consequents  # (m,), (1, m) or (J, m)
+        features = torch.cat([x.expand(self.segments, -1), self.tails], 1)  # (J, m)
         return (features * conclusions).sum(1)
 
     def _firing(self, x: Tensor) -> Tensor:
-        """Normalised firing at x: (1, K), or (J, K) if the action is an antecedent."""
+        """Normalised firing at x: (K,), or (J, K) if the action is an antecedent."""
         if self.coding != "antecedent":
             return self.net.observe(x)
         inputs = self._inputs(x)
@@ -187,25 +186,23 @@ class QLearning:
         values = self.action_values(x, firing).tolist()
         segment = self._roulette(values)
         low, high = self.edges[segment]
-        inside = self.rng.uniform(low, high)
+        inside = low + (high - low) * self.rng.random()
         scalar = self.representatives[segment] if self.actions == "three" else inside
         # The paper draws the action inside the segment also where the robot only has three.
-        code = x.new_tensor(self._code(segment, inside if self.coding == "scalar" else scalar))
-        state = x
+        code = self._code(segment, inside if self.coding == "scalar" else scalar)
+        features = x.new_tensor([*x.tolist(), *code, 1.0])
         if self.coding == "antecedent":
-            state = torch.cat([x, code])
-            firing = net.observe(state)
-        parameters = net.learnable(self.antecedents)
+            x = features[: self.n + 1]
+            firing = net.observe(x)
+        parameters = consequents = net.learnable(self.antecedents)
         if self.antecedents:
-            firing = net.normalised_firing(state[None], parameters)
-        conclusions = parameters[-net.n_outputs :] @ firing[0]
-        value = torch.cat([x, code, x.new_ones(1)]) @ conclusions
+            *antecedents, consequents = parameters.split_with_sizes(net.parts)
+            firing = net.normalised_firing(x, antecedents)
+        value = features @ (consequents @ firing)
         self.value = value.item()
         greedy = values[segment] == max(values)
         decay = self.decay if greedy or not self.trace_cut else 0.0
-        net.accumulate(torch.autograd.grad(value, parameters)[0], decay)
-        if self.trace_limit is not None:
-            net.traces[-net.n_outputs :].clamp_(-self.trace_limit, self.trace_limit)
+        net.accumulate(torch.autograd.grad(value, parameters)[0], decay, self.trace_limit)
         self._log["value"].append(self.value)
         self._log["greedy"].append(greedy)
         self._log["firing"].append(net.max_firing)
@@ -214,7 +211,7 @@ class QLearning:
     def _learn(self, error: float) -> None:
         """Equations 14 and 15 for the temporal-difference error."""
         self._log["error"].append(error)
-        self.net.adapt(self.rates * error)
+        self.net.adapt(self.rates, error)
 
     def _roulette(self, values: list[float]) -> int:
         """A segment drawn with the probabilities of equation 11."""
@@ -239,7 +236,7 @@ class QLearning:
         return torch.cat([x.expand(self.segments, -1), self.codes], 1)
 
     def _tensor(self, observation: np.ndarray) -> Tensor:
-        return torch.as_tensor(observation).to(self.net.default_width)
+        return torch.from_numpy(observation).to(self.rates)
 
     def _command(self, scalar: float) -> np.ndarray:
         return np.array([scalar], np.float32)

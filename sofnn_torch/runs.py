@@ -90,14 +90,16 @@ class Run:
             raise ValueError(f"{path} cannot be used ({error.strerror})") from None
         return run
 
-    def rewind(self, trial: int) -> None:
-        """Cut the trial table to the trials 1..trial and set newer checkpoints aside.
+    def rewind(self, state: dict[str, Any]) -> None:
+        """Go back to a state: cut the trial table to its trials, set newer checkpoints aside.
 
         Raises:
             ValueError: the directory cannot be written.
         """
-        table = self.path / "trials.csv"
+        table, trial = self.path / "trials.csv", state["trial"]
         try:
+            # First, so that there is a checkpoint to go on from whatever happens next.
+            checkpoint.save(self.path / f"checkpoint-{trial}.pt", state)
             for leftover in self.path.glob(".*.tmp"):
                 leftover.unlink()
             newer = [p for p in checkpoint.checkpoints(self.path) if checkpoint.number(p) > trial]
@@ -115,6 +117,7 @@ class Run:
             self._write_settings()
             for path in newer:
                 path.unlink()
+            self.saved = trial
         except OSError as error:
             raise ValueError(f"{self.path} cannot be written ({error.strerror})") from None
 

@@ -154,8 +154,9 @@ def reopen(path: Path, options: RunOptions, trials: int | None = None) -> Sessio
             run.save(state)
         elif done < config.trials:
             run.config = config
-            run.rewind(done)
-        run.saved = done
+            run.rewind(state)
+        else:
+            run.saved = done
         undo.pop_all()
         return Session(run, agent, env, state)
 

@@ -26,10 +26,15 @@ Actions = Literal["three", "steer", "wheels"]
 RIGHT, STRAIGHT, LEFT = 0, 1, 2
 
 
+def surprise(action: Tensor, mean: Tensor, deviation: Tensor) -> Tensor:
+    """Minus the logarithm of equation 5, but for its constant. Shape: that of the arguments."""
+    z = (action - mean) / deviation
+    return torch.addcmul(deviation.log(), z, z, value=0.5)
+
+
 def log_likelihood(action: Tensor, mean: Tensor, deviation: Tensor) -> Tensor:
     """Logarithm of equation 5, with sigma outside the root. Shape: that of the arguments."""
-    z = (action - mean) / deviation
-    return -0.5 * z * z - deviation.log() - 0.5 * math.log(2 * math.pi)
+    return -surprise(action, mean, deviation) - 0.5 * math.log(2 * math.pi)
 
 
 def n_actions(actions: Actions) -> int:
@@ -112,6 +117,8 @@ class SGA:
             n = net.n_inputs
             rates = [rate_centre * scale] * n + [rate_width * scale] * n + rates
         self.rates = net.default_width.new_tensor(rates)[:, None]
+        self.parts = (m, m, 1) if learned else (m, m)  # outputs mu, sigma and value
+        self.unit = self.rates.new_ones(1)
         self.value = 0.0
         self._log = {"mu": [], "sigma": [], "error": [], "firing": []}
 
@@ -132,7 +139,7 @@ class SGA:
         firing = self.net.observe(x)
         error = reward - self.constant
         if self.learned:
-            following = (firing @ self.net.learnable(False).detach()[-1]).item()
+            following = self.net.conclude(firing).tolist()[-1]
             error = reward + self.gamma * following - self.value
         self._learn(error)
         return self._choose(x, firing)
@@ -149,7 +156,7 @@ class SGA:
         log, self._log = self._log, {name: [] for name in self._log}
         if not log["mu"]:
             return {}
-        mu, sigma = torch.cat(log["mu"]), torch.cat(log["sigma"])
+        mu, sigma = self.rates.new_tensor(log["mu"]), self.rates.new_tensor(log["sigma"])
         error = torch.tensor(log["error"] or [0.0])
         return {
             "policy/mu_mean": mu.mean().item(),
@@ -173,38 +180,38 @@ class SGA:
     def _choose(self, x: Tensor, firing: Tensor) -> int | np.ndarray:
         """Sample an action (eq. 5) and add its eligibility to the traces (eq. 6)."""
         net, m = self.net, self.m
-        parameters = net.learnable(self.antecedents)
+        parameters = consequents = net.learnable(self.antecedents)
         if self.antecedents:
-            firing = net.normalised_firing(x[None], parameters)
-        consequents = parameters[-net.n_outputs :]
-        outputs = consequents[: 2 * m] @ firing[0]
-        mean, deviation = outputs[:m], outputs[m:]
-        noise = torch.from_numpy(self.rng.standard_normal(m)).to(outputs)
-        action = (mean + deviation * noise).detach()
-        likelihood = log_likelihood(action, mean, deviation)
-        if self.variance_scaled:
-            likelihood = likelihood * deviation.detach() ** 2
-        objective = likelihood.sum()
-        if self.learned:  # its gradient is the trace of TD(lambda); it does not move antecedents
-            value = consequents[-1] @ firing[0].detach()
-            self.value = value.item()
-            objective = objective + value
+            *antecedents, consequents = parameters.split_with_sizes(net.parts)
+            firing = net.normalised_firing(x, antecedents)
+        mean, deviation, *value = (consequents @ firing).split_with_sizes(self.parts)
+        mu, sigma = mean.detach().cpu().numpy(), deviation.detach().cpu().numpy()
+        noise = [self.rng.standard_normal() for _ in range(m)]
+        action = mu + sigma * np.array(noise, sigma.dtype)
+        weights = -sigma * sigma if self.variance_scaled else -np.ones_like(sigma)
+        unexpected = surprise(torch.from_numpy(action).to(mean), mean, deviation)
+        objective = torch.dot(unexpected, torch.from_numpy(weights).to(mean))
+        if self.learned:  # the gradient of V is the trace of TD(lambda); it moves no antecedents
+            state_value = consequents[-1] @ firing.detach()
+            self.value = state_value.item()
+            # With fixed antecedents the last output has the same gradient, and a cheaper graph.
+            objective = objective + (state_value if self.antecedents else value[0])
         net.accumulate(torch.autograd.grad(objective, parameters)[0], self.decay)
-        self._log["mu"].append(mean.detach())
-        self._log["sigma"].append(deviation.detach())
+        self._log["mu"] += mu.tolist()
+        self._log["sigma"] += sigma.tolist()
         self._log["firing"].append(net.max_firing)
-        return self._command(action.cpu().numpy())
+        return self._command(action)
 
     def _learn(self, error: float) -> None:
         """Equations 7 and 8 for the reinforcement error r - b, then the bounds of mu and sigma."""
         net, m = self.net, self.m
         self._log["error"].append(error)
-        net.adapt(self.rates * error)
+        net.adapt(self.rates, error)
         net.clamp_consequents(0, m, -self.mean_limit, self.mean_limit)
         net.clamp_consequents(m, 2 * m, self.sigma_min, self.sigma_max)
 
     def _tensor(self, observation: np.ndarray) -> Tensor:
-        return torch.as_tensor(observation).to(self.net.default_width)
+        return torch.from_numpy(observation).to(self.rates)
 
     def _command(self, action: np.ndarray) -> int | np.ndarray:
         if self.actions != "three":

@@ -10,9 +10,10 @@ vector of consequents ``c``. For a state ``x``:
 
 Rules are the columns of a table with ``2 n + m`` rows ``[u_1..u_n, v_1..v_n, c_1..c_m]``: with
 the rules along the last axis every reduction over inputs is a vectorised sum, two to three times
-faster at batch size 1 than one row per rule. The table is stored in the blocks of a
-``ParameterList``; a full table appends a block as large as all before it together, so adding a
-rule costs a constant time on average and no Parameter is ever replaced.
+faster at batch size 1 than one row per rule. The Parameters in ``blocks`` are windows side by side
+into the one table; a full table appends a block as large as all before it together, so adding a
+rule costs a constant time on average, no Parameter is ever replaced, and no pass over the rules
+has to join the blocks first.
 """
 
 import math
@@ -84,7 +85,7 @@ class SOFNN(nn.Module):
             raise ValueError(f"growth must be rule, input, literal or frozen, got {growth!r}")
         if max_rules < 1 or block_size < 1:
             raise ValueError("max_rules and block_size must be at least 1")
-        self.n_inputs, self.n_outputs, self.n_rules = n_inputs, n_outputs, 0
+        self.n_inputs, self.n_outputs = n_inputs, n_outputs
         self.growth, self.max_rules = growth, max_rules
         self.theta, self.log_theta = theta, math.log(theta)
         self.min_width, self.block_size, self.refused = min_width, block_size, 0
@@ -100,21 +101,24 @@ class SOFNN(nn.Module):
         self.register_buffer("initial", per(initial, n_outputs, "initial"), persistent=False)
         mask = per(interpolate, n_outputs, "interpolate").bool()
         self.register_buffer("interpolate", mask, persistent=False)
+        self.interpolates = bool(mask.any())
         periods = per(0.0 if periods is None else periods, n_inputs, "periods")[:, None]
         if not (self.default_width >= min_width).all():
             raise ValueError(f"every width must be at least {min_width}, got {width}")
         if (periods < 0).any():
             raise ValueError("a period is positive, or 0 for an input that does not wrap")
         self.register_buffer("periods", periods, persistent=False)  # (n, 1)
-        frequencies = torch.where(periods > 0, 1 / periods, torch.zeros_like(periods))
-        self.register_buffer("frequencies", frequencies, persistent=False)
-        self.wraps = bool((periods > 0).any())
-
-        self.blocks = nn.ParameterList()
-        rows = 2 * n_inputs + n_outputs
+        self.wrapping = [
+            (i, (1 / period).item(), period.item())
+            for i, period in enumerate(periods)
+            if period > 0
+        ]
+        self.parts = (n_inputs, n_inputs, n_outputs)  # rows of u, v and c in the table
+        rows = sum(self.parts)
         self.register_buffer("traces_store", torch.zeros(rows, 0, dtype=dtype))
         self.register_buffer("usage_store", torch.zeros(0, dtype=dtype))
         self.register_buffer("labels_store", torch.zeros(n_inputs, 0, dtype=torch.long))
+        self._allocate([])
 
     # ---------------------------------------------------------------- inference, eqs 1, 2, 4, 10
 
@@ -122,71 +126,93 @@ class SOFNN(nn.Module):
         """All parameters of the active rules, differentiable. Shape: (2n+m, K)."""
         if self.n_rules == 0:
             raise ValueError("the network has no rules yet: call grow(x) or add_rule(centre)")
+        if not torch.is_grad_enabled():
+            return self._active
         whole = self.blocks[0] if len(self.blocks) == 1 else torch.cat(list(self.blocks), 1)
         return whole[:, : self.n_rules]
 
-    def log_memberships(self, x: Tensor, table: Tensor | None = None) -> Tensor:
+    def log_memberships(self, x: Tensor) -> Tensor:
         """Logarithm of equation 1 for x of shape (B, n). Shape: (B, n, K)."""
-        table = self.table() if table is None else table
-        n = self.n_inputs
-        difference = x.unsqueeze(-1) - table[:n]
-        if self.wraps:
-            turns = (difference.detach() * self.frequencies).round() * self.periods
-            difference = difference - turns
-        z = difference / table[n : 2 * n]
-        return -0.5 * (z * z)
+        centres, widths, _ = self.table().split_with_sizes(self.parts)
+        return -0.5 * self._squares(x, centres, widths)
 
     def firing_strengths(self, x: Tensor) -> Tensor:
         """Firing strengths F of equation 2 for x of shape (B, n). Shape: (B, K)."""
-        return self.log_memberships(x).sum(1).exp()
+        return self.log_memberships(x).sum(-2).exp()
 
-    def normalised_firing(self, x: Tensor, table: Tensor | None = None) -> Tensor:
+    def normalised_firing(self, x: Tensor, antecedents: Sequence[Tensor] | None = None) -> Tensor:
         """Normalised firing S for x of shape (B, n). Shape: (B, K).
 
         Computed in log space, so that a state far from every rule is still answered by the
         nearest ones where a product of memberships would underflow to 0 / 0.
+
+        Args:
+            x: states, or one state (n,) for one row (K,).
+            antecedents: centres and widths, each (n, K); those of the network if None.
         """
-        return self.log_memberships(x, table).sum(1).softmax(-1)
+        centres, widths = antecedents or self.table().split_with_sizes(self.parts)[:2]
+        return (-0.5 * self._squares(x, centres, widths).sum(-2)).softmax(-1)
 
     def forward(self, x: Tensor) -> Tensor:
         """Weighted mean of the consequents (eqs 4, 10) for x of shape (B, n). Shape: (B, m)."""
-        table = self.table()
-        return self.normalised_firing(x, table) @ table[2 * self.n_inputs :].T
+        centres, widths, consequents = self.table().split_with_sizes(self.parts)
+        return self.normalised_firing(x, (centres, widths)) @ consequents.T
+
+    def conclude(self, firing: Tensor) -> Tensor:
+        """Outputs (m,) at a state whose normalised firing (K,) is known."""
+        return self._consequents @ firing
+
+    def _squares(self, x: Tensor, centres: Tensor, widths: Tensor) -> Tensor:
+        """((x - u) / v)^2 for x of shape (..., n). Shape: (..., n, K)."""
+        difference = x.unsqueeze(-1) - centres
+        for i, frequency, period in self.wrapping:  # whole turns have no gradient
+            angle = difference.detach().select(-2, i)
+            angle.sub_((angle * frequency).round_(), alpha=period)
+        if torch.is_grad_enabled():
+            return (difference / widths).square()
+        return difference.div_(widths).square_()  # new memory costs as much as the arithmetic
 
     # ------------------------------------------------------------------------- structure, eq. 3
 
-    @torch.no_grad()
     def observe(self, x: Tensor) -> Tensor:
-        """Add at most one rule at the state x (n,) by equation 3; its normalised firing (1, K).
+        """Add at most one rule at the state x (n,) by equation 3; its normalised firing (K,).
 
         The one pass over the rules that a learning step needs: growth test and firing share the
         memberships. Counts the firing in ``usage``.
         """
         if self.n_rules == 0:
             self.add_rule(x)
-        log_memberships = self.log_memberships(x[None])
-        if self._grow(x, log_memberships[0]):
-            log_memberships = self.log_memberships(x[None])
-        firing = log_memberships.sum(1).softmax(-1)
-        self.usage.add_(firing[0])
+        firing = self._grow(x).softmax(0)
+        self._usage.add_(firing)
         return firing
 
-    @torch.no_grad()
     def grow(self, x: Tensor) -> bool:
         """Add at most one rule at the state x of shape (n,) by equation 3; True if one was."""
         if self.n_rules == 0:
             return self.growth != "frozen" and self.add_rule(x)
-        return self._grow(x, self.log_memberships(x[None])[0])
+        before = self.n_rules
+        self._grow(x)
+        return self.n_rules > before
 
-    @torch.no_grad()
-    def _grow(self, x: Tensor, log_memberships: Tensor) -> bool:
-        log_firing = log_memberships.sum(0).max().item()
-        self.max_firing = math.exp(log_firing)
+    def _grow(self, x: Tensor) -> Tensor:
+        """Apply equation 3; the logarithm of every rule's firing strength at x. Shape: (K,)."""
+        squares = self._squares(x, self._centres, self._widths)
+        log_firing = squares.sum(0).mul_(-0.5)
+        best = log_firing.max().item()
+        self.max_firing = math.exp(best)
         if self.growth == "rule":
-            return log_firing < self.log_theta and self.add_rule(x)
-        if self.growth == "literal":
-            return log_memberships.max().item() < self.log_theta and self.add_rule(x)
-        return self.growth == "input" and self._combine(x, log_memberships)
+            added = best < self.log_theta and self.add_rule(x, log_firing=log_firing)
+        elif self.growth == "literal":
+            nearest = -0.5 * squares.min().item()
+            added = nearest < self.log_theta and self.add_rule(x, log_firing=log_firing)
+        else:
+            added = self.growth == "input" and self._combine(x, squares.mul_(-0.5))
+        if not added:
+            return log_firing
+        if self.growth == "input":  # the new rule is centred on other rules' memberships
+            newest = self._squares(x, self._centres[:, -1:], self._widths[:, -1:])
+            return torch.cat([log_firing, newest.sum(0).mul_(-0.5)])
+        return torch.cat([log_firing, log_firing.new_zeros(1)])  # centred on x
 
     def _combine(self, x: Tensor, log_memberships: Tensor) -> bool:
         """Criterion ``input``: labels say which rules share a membership function."""
@@ -196,18 +222,17 @@ class SOFNN(nn.Module):
         labels = torch.where(is_new, self.labels.amax(1) + 1, self.labels[inputs, rule])
         if (self.labels == labels[:, None]).all(0).any():
             return False
-        table = self.table()
-        centre = torch.where(is_new, x, table[inputs, rule])
-        width = torch.where(is_new, self.default_width, table[self.n_inputs + inputs, rule])
+        centre = torch.where(is_new, x, self._centres[inputs, rule])
+        width = torch.where(is_new, self.default_width, self._widths[inputs, rule])
         return self.add_rule(centre, width, labels=labels)
 
-    @torch.no_grad()
     def add_rule(
         self,
         centre: Tensor,
         width: Tensor | None = None,
         consequents: Tensor | None = None,
         labels: Tensor | None = None,
+        log_firing: Tensor | None = None,
     ) -> bool:
         """Append one rule with its traces and counters; False at the cap ``max_rules``.
 
@@ -217,6 +242,7 @@ class SOFNN(nn.Module):
             consequents: the configured or interpolated ones if None. Shape: (m,).
             labels: which shared membership function each input uses; a new one each if None.
                 Shape: (n,).
+            log_firing: logarithm of the firing strengths at the centre, if known. Shape: (K,).
 
         Raises:
             ValueError: a value is not finite or a width is not positive.
@@ -227,21 +253,30 @@ class SOFNN(nn.Module):
             return False
         width = self.default_width if width is None else width
         if consequents is None:
-            known = self.interpolate if k else torch.zeros_like(self.interpolate)
-            present = self(centre[None])[0] if known.any() else self.initial
-            consequents = torch.where(known, present, self.initial)
+            consequents = self._first_consequents(centre, log_firing)
         column = torch.cat([centre, width, consequents])
-        if not column.isfinite().all() or not (width > 0).all():
-            raise ValueError(f"a rule needs finite numbers and positive widths: {column.tolist()}")
+        numbers = column.tolist()
+        widths = numbers[self.n_inputs : 2 * self.n_inputs]
+        if not all(map(math.isfinite, numbers)) or not min(widths) > 0:
+            raise ValueError(f"a rule needs finite numbers and positive widths: {numbers}")
         if k == self.capacity:
             self._append_block(max(k, self.block_size))
-        last = self.blocks[-1]
-        last[:, k - self.capacity] = column  # counted from the end of the last block
+        self._whole[:, k] = column
         if self.growth == "input":
             fresh = self.labels.amax(1) + 1 if k else torch.zeros_like(self.labels_store[:, 0])
             self.labels_store[:, k] = fresh if labels is None else labels
-        self.n_rules = k + 1
+        self._activate(k + 1)
         return True
+
+    def _first_consequents(self, centre: Tensor, log_firing: Tensor | None) -> Tensor:
+        """The configured consequents, or where so configured the present output. Shape: (m,)."""
+        if self.n_rules == 0 or not self.interpolates:
+            return self.initial
+        if log_firing is None:
+            firing = self.normalised_firing(centre, (self._centres, self._widths))
+        else:
+            firing = log_firing.softmax(0)
+        return torch.where(self.interpolate, self.conclude(firing), self.initial)
 
     @torch.no_grad()
     def prune(self, keep: Tensor) -> int:
@@ -252,15 +287,14 @@ class SOFNN(nn.Module):
         """
         if keep.shape != (self.n_rules,) or not keep.any():
             raise ValueError(f"keep must be a mask of {self.n_rules} rules with at least one True")
-        table, stores = (
-            self.table()[:, keep],
-            [s[..., : self.n_rules][..., keep] for s in self._stores()],
-        )
-        dropped, self.n_rules = self.n_rules - table.shape[1], table.shape[1]
-        self._allocate([max(self.n_rules, self.block_size)])
-        self.blocks[0][:, : self.n_rules] = table
-        for store, kept in zip(self._stores(), stores, strict=True):
-            store[..., : self.n_rules] = kept
+        table = self._active[:, keep]
+        stores = [s[..., : self.n_rules][..., keep] for s in self._stores()]
+        dropped, kept = self.n_rules - table.shape[1], table.shape[1]
+        self._allocate([max(kept, self.block_size)])
+        self._whole[:, :kept] = table
+        for store, values in zip(self._stores(), stores, strict=True):
+            store[..., :kept] = values
+        self._activate(kept)
         return dropped
 
     @property
@@ -273,19 +307,60 @@ class SOFNN(nn.Module):
         return self.traces_store, self.usage_store, self.labels_store
 
     def _append_block(self, size: int) -> None:
-        rows, like = self.traces_store.shape[0], self.default_width
-        block = torch.zeros(rows, size, dtype=like.dtype, device=like.device)
-        self.blocks.append(nn.Parameter(block))
+        self.blocks.append(nn.Parameter(self._whole.new_zeros(len(self._whole), size)))
         for name in ("traces_store", "usage_store", "labels_store"):
             store = getattr(self, name)
             setattr(self, name, torch.cat([store, store.new_zeros(*store.shape[:-1], size)], -1))
+        self._join()
 
     def _allocate(self, sizes: Sequence[int]) -> None:
         self.blocks = nn.ParameterList()
         for name in ("traces_store", "usage_store", "labels_store"):
             setattr(self, name, getattr(self, name)[..., :0])
+        self.n_rules = 0
+        self._join()
         for size in sizes:
             self._append_block(size)
+
+    def _join(self) -> None:
+        """Make the blocks windows into one table, wherever their numbers were before."""
+        blocks = [block.detach() for block in self.blocks]
+        self._whole = torch.cat([torch.zeros_like(self.traces_store[:, :0]), *blocks], 1)
+        windows = self._whole.split_with_sizes([block.shape[1] for block in blocks], 1)
+        for block, window in zip(self.blocks, windows, strict=True):
+            block.data = window
+        self._activate(self.n_rules)
+
+    def _activate(self, n_rules: int) -> None:
+        """Set the number of rules, and the views of what belongs to them.
+
+        A view costs as much as arithmetic on a thousand numbers: they are made here, not in every
+        decision.
+        """
+        active, traces = self._whole[:, :n_rules], self.traces_store[:, :n_rules]
+        centres, widths, consequents = active.split_with_sizes(self.parts)
+        m = self.n_outputs
+        self.__dict__.update(  # past Module.__setattr__, which is slow
+            n_rules=n_rules,
+            _active=active,
+            _centres=centres,
+            _widths=widths,
+            _consequents=consequents,
+            _traces=traces,
+            _consequent_traces=traces[-m:],
+            _usage=self.usage_store[:n_rules],
+            # By the number of rows that learn.
+            _learning={m: (consequents, traces[-m:]), len(active): (active, traces)},
+        )
+
+    def _apply(self, *arguments) -> "SOFNN":
+        super()._apply(*arguments)  # to another device or type, block by block
+        self._join()
+        return self
+
+    def __setstate__(self, state: dict) -> None:
+        super().__setstate__(state)  # a copy: the windows have become tables of their own
+        self._join()
 
     # --------------------------------------------------------------- learning, eqs 6, 8, 14, 15
 
@@ -294,66 +369,63 @@ class SOFNN(nn.Module):
 
         Shape: (2n+m, K) with antecedents, (m, K) without; then the firing needs no gradient.
         """
-        if antecedents:
-            return self.table()
-        return self.table().detach()[2 * self.n_inputs :].requires_grad_()
+        return (self._active if antecedents else self._consequents).detach().requires_grad_()
 
-    @torch.no_grad()
-    def accumulate(self, gradient: Tensor, decay: float) -> None:
-        """E <- e + decay E (eq. 6) for the last rows of the table, as many as gradient has."""
-        traces = self.traces[-gradient.shape[0] :]
-        traces.mul_(decay).add_(gradient)
-
-    @torch.no_grad()
-    def adapt(self, rates: Tensor) -> None:
-        """W <- W + rates E (eqs 8, 14, 15) for the last rows of the table.
+    def accumulate(self, gradient: Tensor, decay: float, limit: float | None = None) -> None:
+        """E <- e + decay E (eq. 6) for the last rows of the table, as many as gradient has.
 
         Args:
-            rates: learning rate of each row times the reinforcement. Shape: (rows, 1).
+            gradient: e, the gradient. Shape: (rows, K).
+            decay: gamma lambda.
+            limit: bound of the consequents' traces, None for no bound.
         """
-        rows = rates.shape[0]
-        start = 0
-        for block in self.blocks:
-            stop = min(start + block.shape[1], self.n_rules)
-            part = block[-rows:, : stop - start]
-            part.addcmul_(rates, self.traces_store[-rows:, start:stop])
-            if rows > self.n_outputs:
-                block[self.n_inputs : 2 * self.n_inputs].clamp_(min=self.min_width)
-            start = stop
+        _, traces = self._learning[gradient.shape[0]]
+        traces.mul_(decay).add_(gradient)
+        if limit is not None:
+            self._consequent_traces.clamp_(-limit, limit)
 
-    @torch.no_grad()
+    def adapt(self, rates: Tensor, error: float = 1.0) -> None:
+        """W <- W + error rates E (eqs 8, 14, 15) for the last rows of the table.
+
+        Args:
+            rates: learning rate of each row. Shape: (rows, 1).
+            error: the reinforcement.
+        """
+        parameters, traces = self._learning[rates.shape[0]]
+        parameters.addcmul_(rates, traces, value=error)
+        if parameters is self._active:
+            self._widths.clamp_(min=self.min_width)
+
     def clamp_consequents(self, first: int, last: int, low: float, high: float) -> None:
         """Keep the consequents first..last-1 of every rule between low and high."""
-        rows = slice(2 * self.n_inputs + first, 2 * self.n_inputs + last)
-        for block in self.blocks:
-            block[rows].clamp_(low, high)
+        self._consequents[first:last].clamp_(low, high)
 
     # ---------------------------------------------------------------------------- views and state
 
     @property
     def centres(self) -> Tensor:
         """Centres u of the membership functions. Shape: (K, n)."""
-        return self.table().detach()[: self.n_inputs].T
+        return self._centres.T
 
     @property
     def widths(self) -> Tensor:
         """Widths v of the membership functions. Shape: (K, n)."""
-        return self.table().detach()[self.n_inputs : 2 * self.n_inputs].T
+        return self._widths.T
 
     @property
     def consequents(self) -> Tensor:
         """Consequents c of the rules. Shape: (K, m)."""
-        return self.table().detach()[2 * self.n_inputs :].T
+        return self._consequents.T
 
     @property
     def traces(self) -> Tensor:
         """Eligibility traces E. Shape: (2n+m, K)."""
-        return self.traces_store[:, : self.n_rules]
+        return self._traces
 
     @property
     def usage(self) -> Tensor:
         """Sum of the normalised firing of each rule since it was last cleared. Shape: (K,)."""
-        return self.usage_store[: self.n_rules]
+        return self._usage
 
     @property
     def labels(self) -> Tensor:
@@ -383,16 +455,21 @@ class SOFNN(nn.Module):
         """Counterpart of `get_extra_state`."""
         if not 0 <= state["n_rules"] <= self.capacity:
             raise ValueError(f"{state['n_rules']} rules do not fit {self.capacity} columns")
-        self.n_rules, self.refused = state["n_rules"], state["refused"]
+        self.refused = state["refused"]
+        self._activate(state["n_rules"])
 
-    def _load_from_state_dict(self, state_dict, prefix, *args) -> None:
+    def _load_from_state_dict(self, state_dict, prefix, local_metadata, *args) -> None:
+        if local_metadata.get("assign_to_params_buffers"):
+            raise ValueError(
+                "load_state_dict(assign=True) would tear the blocks apart: leave it out"
+            )
         # Growing to the stored size first lets a fresh network load a grown one strictly.
         sizes, i = [], 0
         while (block := state_dict.get(f"{prefix}blocks.{i}")) is not None:
             sizes.append(block.shape[-1])
             i += 1
         self._allocate(sizes)
-        super()._load_from_state_dict(state_dict, prefix, *args)
+        super()._load_from_state_dict(state_dict, prefix, local_metadata, *args)
 
 
 def grid(
@@ -425,8 +502,7 @@ def grid(
     ]
     centres = torch.cartesian_prod(*axes).reshape(count, len(shape)).to(like)
     net._allocate([count])
-    with torch.no_grad():
-        columns = [centres, like.expand(count, -1), net.initial.expand(count, -1)]
-        net.blocks[0].copy_(torch.cat(columns, 1).T)
-    net.n_rules = count
+    columns = [centres, like.expand(count, -1), net.initial.expand(count, -1)]
+    net._whole.copy_(torch.cat(columns, 1).T)
+    net._activate(count)
     return net

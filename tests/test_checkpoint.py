@@ -308,7 +308,7 @@ def test_a_failed_write_leaves_the_old_file(failing, state, tmp_path, monkeypatc
 
 @trials_of(max_examples=100, deadline=None)
 @given(st.binary(max_size=400))
-def test_any_trial_table_is_cut_or_refused_in_one_line(data):
+def test_any_trial_table_is_cut_or_refused_in_one_line(state, data):
     """A torn, foreign or empty trials.csv never ends a resume with a traceback."""
     import tempfile
 
@@ -318,7 +318,7 @@ def test_any_trial_table_is_cut_or_refused_in_one_line(data):
         run = Run.create(directory, "run", config, keep=3)
         (run.path / "trials.csv").write_bytes(data)
         try:
-            run.rewind(2)
+            run.rewind(state)
         except ValueError as error:
             assert "\n" not in str(error)
         finally:

@@ -92,6 +92,18 @@ def test_a_run_killed_again_and_again_resumes_bit_for_bit(references, tmp_path):
     assert_same_end(run, reference)
 
 
+@pytest.mark.parametrize("kind", ["file", "fsync", "half written"])
+def test_a_run_killed_twice_at_its_very_beginning(kind, references, tmp_path):
+    """Each death comes before, while or after the first checkpoint or the first record."""
+    reference, _ = references("sga")
+    for first in range(1, 8):
+        for second in (3, 6, 9, 12):
+            run, _ = live_through(
+                "sga", tmp_path / f"{first} {second}", [(kind, first), (kind, second)]
+            )
+            assert_same_end(run, reference)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("point", range(5))
 @pytest.mark.parametrize("kind", doomed.MOMENTS)
@@ -114,8 +126,10 @@ def test_kills_by_the_clock(case, references, tmp_path):
         child = doomed.start(config, options, run)
         time.sleep(clock.uniform(0.02, 0.3) * (1 + kills / 10))  # also on a slow machine
         child.kill()
-        if doomed.finish(child) == 0:
+        code = doomed.finish(child)
+        if code == 0:
             break
+        assert code == -signal.SIGKILL
         kills += 1
         assert kills < 100
     assert kills

@@ -1,0 +1,153 @@
+"""Speed of a full training run over that of its physics alone.
+
+A run with everything on (learning, monitoring, checkpoints) is timed from its first trial to its
+last checkpoint, then a bare loop of `mj_step` calls with the same model and the wheel commands
+recorded from that run. Both alternate in one process; ratios are medians over the repeats. The
+learner starts with the stated number of rules and nothing learned, so that half of its decisions
+end at a wall, after some 5 steps instead of 10: the dearest phase of a run. `--run` measures a run
+of your own instead, from its newest checkpoint on.
+
+    python benchmarks/training.py --out training.json
+    python benchmarks/training.py --run runs/sga-sofnn-estimated-s0
+"""
+
+import dataclasses
+import shutil
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+from learning import SIZES, fill
+from physics import VARIANTS
+from timing import arguments, median, ratio, report
+
+from sofnn_torch import session, training
+from sofnn_torch.config import preset
+from sofnn_torch.guard import SignalTrap
+from sofnn_torch.odometry import WHEEL_RADIUS
+from sofnn_torch.physics import Physics
+from sofnn_torch.session import RunOptions, Session
+
+Commands = list[list[tuple[float, float]]]  # of both wheels [rad/s], trial by trial
+
+
+def options_in(runs: Path) -> RunOptions:
+    """Return the default options but for the pictures, whose cost is stated apart."""
+    return RunOptions(runs=runs, picture_every=0, video_every=0, quiet=True)
+
+
+def fresh(name: str, rules: int, model: mujoco.MjModel | None, trials: int) -> Callable[..., Any]:
+    """Return a function that begins a run in a directory."""
+    config = preset(name, "sofnn", "default")
+    net = dataclasses.replace(config.net, max_rules=rules + 5_000)
+    maze = dataclasses.replace(config.maze, max_steps=2_000)
+    config = dataclasses.replace(config, trials=trials, net=net, maze=maze)
+
+    def begin(runs: Path) -> Session:
+        begun = session.begin(config, options_in(runs))
+        fill(begun.agent.net, rules)
+        if model is not None:
+            begun.env.physics = Physics(model)
+        return begun
+
+    return begin
+
+
+def continued(run: Path, trials: int) -> Callable[..., Any]:
+    """Return a function that goes on with a copy of a run in a directory."""
+    done = max(int(file.stem.partition("-")[2]) for file in run.glob("checkpoint-*.pt"))
+
+    def begin(runs: Path) -> Session:
+        copy = Path(shutil.copytree(run, runs / run.name))
+        return session.reopen(copy, options_in(runs), trials=done + trials)
+
+    return begin
+
+
+def timed_run(begin: Callable[..., Any]) -> float:
+    """Return the seconds of one run."""
+    with tempfile.TemporaryDirectory() as directory:
+        begun = begin(Path(directory))
+        start = time.perf_counter()
+        training._loop(begun, options_in(Path(directory)), SignalTrap())
+        return time.perf_counter() - start
+
+
+def recorded_run(begin: Callable[..., Any]) -> tuple[Commands, Session]:
+    """Return the wheel commands of a run, which are the same in every repeat, and the run."""
+    commands: Commands = []
+    with tempfile.TemporaryDirectory() as directory:
+        begun = begin(Path(directory))
+        physics = begun.env.physics
+        place, drive = physics.place, physics.drive
+
+        def note_place(pose: Any) -> None:
+            commands.append([])
+            place(pose)
+
+        def note_drive(left: float, right: float) -> None:
+            commands[-1].append((left / WHEEL_RADIUS, right / WHEEL_RADIUS))
+            drive(left, right)
+
+        physics.place, physics.drive = note_place, note_drive
+        training._loop(begun, options_in(Path(directory)), SignalTrap())
+        physics.place, physics.drive = place, drive
+    return commands, begun
+
+
+def bare(physics: Physics, commands: Commands) -> float:
+    """Return the seconds of the physics alone."""
+    model, data, substeps, step = physics.model, physics.data, physics.substeps, mujoco.mj_step
+    control = data.ctrl
+    start = time.perf_counter()
+    for trial in commands:
+        physics.place(physics.plan.start)
+        for left, right in trial:
+            control[0] = left
+            control[1] = right
+            step(model, data, substeps)
+    return time.perf_counter() - start
+
+
+def measure(begin: Callable[..., Any], repeats: int) -> dict[str, Any]:
+    """Return the times of a run and of its physics."""
+    commands, begun = recorded_run(begin)
+    steps = sum(map(len, commands))
+    times = [(timed_run(begin), bare(begun.env.physics, commands)) for _ in range(repeats)]
+    full, alone = np.array(times).T / steps * 1e6
+    return {
+        "rules": begun.agent.net.n_rules,
+        "steps": steps,
+        "bare us/step": median(alone),
+        "training us/step": median(full),
+        "ratio": ratio(alone, full),
+    }
+
+
+def main() -> None:
+    """Measure, print a table, and write it as JSON."""
+    options = arguments(__doc__, repeats=7, run="a run directory to measure instead")
+    if options.run:
+        report(
+            options,
+            training=[
+                {"run": options.run.name} | measure(continued(options.run, 5), options.repeats)
+            ],
+        )
+        return
+    reference = VARIANTS[0].build().model
+    rows = []
+    for physics, model, trials, share in (("ours", None, 4, 1), ("reference", reference, 1, 3)):
+        for rules in SIZES:
+            for name in ("sga", "q"):
+                row = measure(fresh(name, rules, model, trials), max(3, options.repeats // share))
+                rows.append({"learner": name, "physics": physics} | row)
+    report(options, training=rows)
+
+
+if __name__ == "__main__":
+    main()
