@@ -6,6 +6,7 @@ stops a training: what cannot be written or drawn is said once and left out.
 """
 
 import dataclasses
+import gc
 import io
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -211,6 +212,7 @@ class Monitor:
             figure, (ax,) = figures.canvas(width=5, height=5, tight=False)
             draw(ax)
             self._image(f"pictures/{name}", figures.png(figure, dpi=100), trial)
+        gc.collect()  # figures refer to themselves: 200 MiB would wait for the next full collection
 
     def _video(self, trial: int, agent: Agent) -> None:
         frames = film(self.config, agent, steps_per_frame=10, limit=VIDEO_STEPS, size=240)

@@ -20,7 +20,7 @@ from sofnn_torch import checkpoint, monitoring, training
 from sofnn_torch.checkpoint import CheckpointError
 from sofnn_torch.config import make_agent, make_env
 from sofnn_torch.guard import Divergence, Interrupted
-from sofnn_torch.runs import Run, default_name
+from sofnn_torch.runs import Run, default_name, load_config
 from sofnn_torch.training import play
 
 NAME = default_name(settings())
@@ -158,7 +158,7 @@ def test_a_deleted_directory_is_made_anew(when, options, reference, between_tria
     between_trials(**{when: lambda: shutil.rmtree(run)})
     assert training.train(settings(), options) == run
     same_end(run, reference)
-    assert (run / "config.json").read_bytes() == (reference / "config.json").read_bytes()
+    assert load_config(run) == load_config(reference)
     (line,) = warnings(capsys)
     assert "was deleted" in line
 

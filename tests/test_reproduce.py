@@ -275,6 +275,12 @@ def test_verdicts_are_of_whole_intervals(interval, verdict):
     assert claims.judge(evaluate.Estimate(0.5, *interval), 0.5, 1) == verdict
 
 
+def test_a_path_passes_a_point_between_two_poses():
+    poses = np.array([[0.0, 0, 0], [1, 0, 0], [1, 0, 2], [1, 1, 2]])
+    assert claims._distances(poses, (0.4, 0.1))[0] == pytest.approx(0.1)
+    assert claims._distances(poses, (1.3, 0.4)) == pytest.approx([0.5, 0.5, 0.3])
+
+
 LEVEL = {"sga-sofnn": 500, "q-sofnn": 520, "sga-fixed": 560, "q-fixed": 20_000}  # steps at the end
 
 

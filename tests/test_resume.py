@@ -92,16 +92,26 @@ def test_a_run_killed_again_and_again_resumes_bit_for_bit(references, tmp_path):
     assert_same_end(run, reference)
 
 
-@pytest.mark.parametrize("kind", ["file", "fsync", "half written"])
-def test_a_run_killed_twice_at_its_very_beginning(kind, references, tmp_path):
-    """Each death comes before, while or after the first checkpoint or the first record."""
+def assert_two_deaths_do_no_harm(kind, first, second, references, tmp_path):
     reference, _ = references("sga")
-    for first in range(1, 8):
-        for second in (3, 6, 9, 12):
-            run, _ = live_through(
-                "sga", tmp_path / f"{first} {second}", [(kind, first), (kind, second)]
-            )
-            assert_same_end(run, reference)
+    runs = tmp_path / f"{kind} {first} {second}"
+    assert_same_end(live_through("sga", runs, [(kind, first), (kind, second)])[0], reference)
+
+
+@pytest.mark.parametrize(
+    "kind,first,second", [("file", 5, 13), ("file", 7, 13), ("file", 7, 15), ("fsync", 3, 5)]
+)
+def test_a_run_killed_twice_at_its_beginning(kind, first, second, references, tmp_path):
+    """Before the first checkpoint, and again before the second."""
+    assert_two_deaths_do_no_harm(kind, first, second, references, tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("first", range(1, 10))
+@pytest.mark.parametrize("kind", ["file", "fsync", "half written"])
+def test_a_run_killed_at_any_two_early_moments(kind, first, references, tmp_path):
+    for second in range(1, 16):
+        assert_two_deaths_do_no_harm(kind, first, second, references, tmp_path)
 
 
 @pytest.mark.slow

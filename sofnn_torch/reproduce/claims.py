@@ -1,8 +1,10 @@
 """What the paper claims and what was to be reached, judged on the data by stated criteria."""
 
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sofnn_torch.evaluate import Estimate, proportion
 from sofnn_torch.physics import Physics
@@ -16,7 +18,7 @@ PRINTED = {  # steps after learning, rules of SOFNN, rules of FSFNN
 }
 LAST = 10  # training trials at the end that say whether a seed arrives
 SAME = (0.9, 1.1)  # ratios in between count as equal
-RESET = 1e-4  # m, error of a position estimate that was just corrected
+RESET = 0.003  # m, largest error after a decision in which a position estimate was corrected
 
 HOW = """\
 A claim *holds* if the whole 95 % interval of what we measured agrees with the criterion, it *does
@@ -43,19 +45,26 @@ def arriving(data: Data, arm: str) -> tuple[int, int]:
 
 
 def resets(data: Data, arm: str) -> tuple[int, int, float]:
-    """Paths whose error was reset at two sub-goals, all paths, median largest error [m]."""
+    """Paths with a reset at both sub-goals, all paths, median largest error [m]."""
     plan = Physics().plan
     twice, largest = 0, []
     paths = last_paths(data, arm)
     for path in paths.values():
         error = np.hypot(*(path.true - path.estimated)[:, :2].T)
         largest.append(error.max())
-        count = 0
-        for centre in plan.subgoals:
-            inside = np.hypot(*(path.true[:, :2] - centre).T) < plan.subgoal_radius
-            count += bool((error[inside] < RESET).any())
-        twice += count == 2
+        twice += all(
+            (error[1:][_distances(path.true, centre) < plan.subgoal_radius] < RESET).any()
+            for centre in plan.subgoals
+        )
     return twice, len(paths), float(np.median(largest)) if largest else 0.0
+
+
+def _distances(poses: NDArray[Any], point: tuple[float, float]) -> NDArray[np.float64]:
+    """Least distance of each stretch of a path to a point. Shape: (T - 1,)."""
+    begin, way = poses[:-1, :2], np.diff(poses[:, :2], axis=0)
+    length = np.maximum((way**2).sum(1), 1e-18)
+    share = np.clip(((point - begin) * way).sum(1) / length, 0, 1)
+    return np.hypot(*(begin + share[:, None] * way - point).T)
 
 
 def claims(data: Data) -> Iterator[tuple[str, str, str, str]]:

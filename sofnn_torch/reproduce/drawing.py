@@ -67,6 +67,7 @@ def _of_the_paper(data: Data) -> Iterator[tuple[str, Figure | None, str]]:
         if arms:
             figure, (ax,) = figures.canvas(width=5, height=3.3)
             figures.learning_curves(arms, ax, reference=optimum)
+            _legend_above(ax)
             text = (
                 f"Fig. {number}: steps to the goal, {AGENTS[agent]}, estimated pose. {BAND} {LIMIT}"
             )
@@ -81,6 +82,7 @@ def _of_the_paper(data: Data) -> Iterator[tuple[str, Figure | None, str]]:
         figures.learning_curves(arms, ax, "rules", "rules")
         ax.yaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
         ax.set_ylim(bottom=0)
+        _legend_above(ax)
         yield "fig9", figure, f"Fig. 9: number of rules after each trial, estimated pose. {BAND}"
     panels = {
         agent: _curves(data, {f"{p} pose": f"{agent}-sofnn-{p}" for p in ("estimated", "true")})
@@ -91,6 +93,7 @@ def _of_the_paper(data: Data) -> Iterator[tuple[str, Figure | None, str]]:
         for ax, (agent, arms) in zip(axes, panels.items(), strict=True):
             figures.learning_curves(arms, ax, reference=optimum)
             ax.set_title(f"{AGENTS[agent]}, SOFNN")
+            ax.legend(loc="upper right")
         axes[1].sharey(axes[0])
         yield (
             "fig10",
@@ -108,9 +111,15 @@ def _of_the_paper(data: Data) -> Iterator[tuple[str, Figure | None, str]]:
             figure,
             "Fig. 11: distance between true and estimated position on the way to the goal in the "
             "last training trial, one point for each decision. Dark: the seed of median length; "
-            "faint: the other seeds that reached the goal. Shaded: inside a sub-goal, where the "
-            "estimate is corrected.",
+            "faint: the other seeds that reached the goal. Shaded: the dark one is inside a "
+            "sub-goal, where the estimate is corrected.",
         )
+
+
+def _legend_above(ax: Axes) -> None:
+    """Where it covers nothing; matplotlib's search for such a place is slow with many curves."""
+    with matplotlib.rc_context(figures.STYLE):
+        ax.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=2, borderaxespad=0.2)
 
 
 def _curves(data: Data, names: dict[str, str], quantity: str = "steps") -> dict[str, Any]:
