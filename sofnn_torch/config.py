@@ -77,16 +77,21 @@ class SGAConfig:
     """Multiply the policy's learning rates by (1 - gamma), as eq. 8 prints."""
     variance_scaled: bool = True
     """Multiply eligibilities by sigma squared, which keeps steps bounded as sigma shrinks."""
-    initial_value: float = 1.0
-    """Value of an unknown state (baseline `value`); the goal's reward is optimistic."""
+    initial_value: float = 0.65
+    """Value of an unknown state (baseline `value`); optimistic at the start of the maze."""
     sigma_initial: float = 0.3
     """Standard deviation of the first rule, and of new rules without interpolation."""
-    sigma_min: float = 0.03
+    sigma_min: float = 0.15
     """Lower bound of sigma."""
     sigma_max: float = 1.0
     """Upper bound of sigma."""
     mean_limit: float = 1.0
     """Bound of |mu|."""
+    replays: int = 50
+    """Batches of remembered decisions to learn from again at the beginning of each trial; 0 for
+    none. Needs baseline `value`."""
+    memory: int = 20_000
+    """Decisions that are remembered."""
 
 
 @dataclass(frozen=True)
@@ -112,16 +117,21 @@ class QConfig:
     """Bound of the consequents' traces; None for no bound."""
     rate_state: float = 0.0
     """Learning rate of c_x."""
-    rate_action: float = 0.5
+    rate_action: float = 1.0
     """Learning rate of c_a."""
-    rate_constant: float = 0.5
+    rate_constant: float = 0.0
     """Learning rate of c."""
     rate_centre: float = 0.0
     """Learning rate of the centres u; 0 leaves them where they were put."""
     rate_width: float = 0.0
     """Learning rate of the widths v; 0 leaves them as they are."""
-    initial: float = 100.0
-    """Initial c of a rule, the value of an unknown state; the goal's reward is optimistic."""
+    initial: float = 65.0
+    """Initial c of a rule, the value of an unknown state; optimistic at the start of the maze."""
+    replays: int = 50
+    """Batches of remembered decisions to learn from again at the beginning of each trial; 0 for
+    none."""
+    memory: int = 20_000
+    """Decisions that are remembered."""
 
 
 @dataclass(frozen=True)
@@ -136,9 +146,9 @@ class MazeConfig:
     """Motor noise; 0.1 multiplies the forward speed by U(0.9, 1.1) in each step."""
     wheel_noise: Literal["common", "independent"] = "common"
     """One factor for the forward and one for the turning part, or one for each wheel."""
-    dead_reckoning: Literal["guarded", "literal"] = "guarded"
-    """`guarded`: no advance on a bump, inside the arena, reset at every pass of a sub-goal or the
-    start; `literal`: the paper's."""
+    dead_reckoning: Literal["guarded", "still", "literal"] = "guarded"
+    """`guarded`: slides along a wall on a bump, inside the arena, reset at every pass of a sub-goal
+    or the start; `still`: the same, but no advance on a bump; `literal`: the paper's."""
     goal_reward: float = 1.0
     """Reward at the goal."""
     collision_reward: float = -1e-4
@@ -225,6 +235,7 @@ def _paper(agent: str, network: str) -> Config:
         rate_width=0.001,
         one_minus_gamma=True,
         variance_scaled=False,
+        replays=0,
     )
     q_settings = QConfig(
         coding="antecedent",
@@ -237,6 +248,7 @@ def _paper(agent: str, network: str) -> Config:
         rate_centre=0.001,
         rate_width=0.001,
         initial=0.0,
+        replays=0,
     )
     rewards = (1.0, -1e-4) if agent == "sga" else (100.0, -0.1)
     maze = MazeConfig(
@@ -288,10 +300,10 @@ def _typed(value: Any, hint: Any, name: str) -> Any:
 POSITIVE = {"hold", "max_steps", "width_position", "width_heading", "width_action", "max_rules"}
 POSITIVE |= {"grid", "grid_action", "segments", "temperature", "sigma_initial", "sigma_min"}
 POSITIVE |= {"sigma_max", "mean_limit", "wheel_radius_scale", "wheel_base_scale", "trials"}
-POSITIVE |= {"trace_limit"}
+POSITIVE |= {"trace_limit", "memory"}
 UNIT = {"gamma", "trace_decay"}  # in [0, 1]
-NOT_NEGATIVE = {"seed"}
-MOST = {"hold": 10_000, "segments": 1_000, "max_rules": 10_000_000}  # memory grows with these
+NOT_NEGATIVE = {"seed", "replays"}
+MOST = {"hold": 10_000, "segments": 1_000, "max_rules": 10_000_000, "memory": 10_000_000}
 
 
 def validate(config: Any, prefix: str = "") -> None:
@@ -327,6 +339,8 @@ def validate(config: Any, prefix: str = "") -> None:
         config.sigma_min <= config.sigma_initial <= config.sigma_max
     ):
         raise ValueError("need --sga.sigma-min <= --sga.sigma-initial <= --sga.sigma-max")
+    if isinstance(config, SGAConfig) and config.replays and config.baseline == "constant":
+        raise ValueError("--sga.replays needs --sga.baseline value: set --sga.replays 0")
     if isinstance(config, QConfig) and config.actions == "three" and config.segments != 3:
         raise ValueError("--q.actions three needs --q.segments 3")
     if isinstance(config, Config) and config.network == "fixed":

@@ -71,7 +71,7 @@ class KheperaMazeEnv(gymnasium.Env[np.ndarray, Any]):
             max_steps: trial limit in simulator steps.
             motor_noise: relative half-width of the uniform motor noise, see `MotorNoise`.
             wheel_noise: "common" or "independent", see `MotorNoise`.
-            dead_reckoning: "guarded" or "literal", see `DeadReckoning`.
+            dead_reckoning: "guarded", "still" or "literal", see `DeadReckoning`.
             goal_reward: reward at the goal.
             collision_reward: reward for a decision that ends in a bump.
             subgoal_reward: reward for each sub-goal, once a trial.
@@ -255,7 +255,8 @@ class KheperaMazeEnv(gymnasium.Env[np.ndarray, Any]):
             now = physics.wheel_travel()
             rolled_left, rolled_right = now[0] - counted[0], now[1] - counted[1]
         scale = self.wheel_radius_scale
-        self.estimator.update(rolled_left * scale, rolled_right * scale, bumped)
+        walls = physics.wall_bearings() if bumped else ()
+        self.estimator.update(rolled_left * scale, rolled_right * scale, walls)
 
         found = self._find_landmarks(x, y)
         success = _within(x, y, self.plan.goal, self.plan.goal_radius)

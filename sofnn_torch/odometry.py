@@ -6,6 +6,7 @@ from collections.abc import Sequence
 STEP_SECONDS = 0.5
 WHEEL_BASE = 0.050  # m, distance between the wheels
 WHEEL_RADIUS = 0.008  # m
+DRAG = 1.7  # sideways drag of the tyres over that of the drive, of the simulated robot
 
 Pose = tuple[float, float, float]
 
@@ -70,10 +71,11 @@ class MotorNoise:
 class DeadReckoning:
     """Pose estimate that adds up wheel movements, with fixes where the robot knows its place.
 
-    `mode="guarded"` (default): a bumped step does not move the estimate, which also stays inside
-    the arena, and the estimate is set to the truth whenever the robot passes a landmark (a
-    sub-goal or the start). `mode="literal"`, as printed in the paper: it always moves, and is
-    set to the truth only when a sub-goal is found for the first time in a trial.
+    `mode="guarded"` (default): in a bumped step the estimate slides along the wall that the robot
+    feels, as the robot does. The estimate stays inside the arena, and it is set to the truth
+    whenever the robot passes a landmark (a sub-goal or the start). `mode="still"`: the same, but
+    a bumped step does not move it. `mode="literal"`, as printed in the paper: it always moves,
+    and is set to the truth only when a sub-goal is found for the first time in a trial.
     """
 
     def __init__(
@@ -82,18 +84,20 @@ class DeadReckoning:
         """Start at the origin.
 
         Args:
-            mode: "guarded" or "literal".
+            mode: "guarded", "still" or "literal".
             wheel_base: distance between the wheels [m] that the robot believes it has.
             arena: width and height [m] of the area the estimate may not leave.
 
         Raises:
             ValueError: if `mode` is unknown or `wheel_base` is not positive.
         """
-        if mode not in ("guarded", "literal"):
-            raise ValueError(f'dead_reckoning must be "guarded" or "literal", not {mode!r}')
+        if mode not in ("guarded", "still", "literal"):
+            raise ValueError(
+                f'dead_reckoning must be "guarded", "still" or "literal", not {mode!r}'
+            )
         if not wheel_base > 0.0:
             raise ValueError(f"wheel_base must be positive, not {wheel_base}")
-        self.guarded = mode == "guarded"
+        self.guarded, self.slides = mode != "literal", mode == "guarded"
         self.wheel_base = wheel_base
         self.width, self.height = arena
         self.pose: Pose = (0.0, 0.0, 0.0)
@@ -102,11 +106,48 @@ class DeadReckoning:
         """Set the estimate to a known pose (x [m], y [m], heading [rad])."""
         self.pose = (pose[0], pose[1], wrap_angle(pose[2]))
 
-    def update(self, left: float, right: float, bumped: bool) -> None:
-        """Add one step in which the wheels rolled `left` and `right` [m]."""
+    def update(self, left: float, right: float, walls: Sequence[float] = ()) -> None:
+        """Add one step in which the wheels rolled `left` and `right` [m].
+
+        Args:
+            left: way of the left wheel.
+            right: way of the right wheel.
+            walls: directions of the touched walls, seen from the robot's heading [rad].
+        """
         distance, turn = differential_drive(left, right, self.wheel_base)
         if not self.guarded:
             self.pose = advance(self.pose, distance, turn)
             return
-        x, y, heading = advance(self.pose, 0.0 if bumped else distance, turn)
+        x, y, heading = self.pose
+        if not walls:
+            x, y, heading = advance(self.pose, distance, turn)
+        else:
+            if self.slides:
+                along, aside = slide(distance, walls)
+                x += along * math.cos(heading) - aside * math.sin(heading)
+                y += along * math.sin(heading) + aside * math.cos(heading)
+            heading = wrap_angle(heading + turn)
         self.pose = (min(max(x, 0.0), self.width), min(max(y, 0.0), self.height), heading)
+
+
+def slide(distance: float, walls: Sequence[float]) -> tuple[float, float]:
+    """Return the way [m], forward and to the left, of a robot that drives against walls.
+
+    At an angle `b` to a wall the robot slides by `cos b / (cos^2 b + DRAG sin^2 b)` of the way that
+    it drives: along its heading the drive gives way, across it the tyres do, `DRAG` times as hard.
+
+    Args:
+        distance: way [m] that the wheels would drive it.
+        walls: directions of the walls, seen from the robot's heading [rad].
+    """
+    along, aside = distance, 0.0
+    for bearing in walls:
+        c, s = math.cos(bearing), math.sin(bearing)
+        against = along * c + aside * s
+        if against > 1e-9:  # m; the second contact with the same wall changes nothing
+            along, aside = along - against * c, aside - against * s
+            tangent = math.hypot(along, aside)
+            share = (tangent / distance) ** 2
+            resistance = share + DRAG * (1.0 - share)
+            along, aside = along / resistance, aside / resistance
+    return along, aside

@@ -154,6 +154,12 @@ class Physics:
         """Return whether the robot touches a wall at the end of the step."""
         return self.data.ncon > self._supports
 
+    def wall_bearings(self) -> list[float]:
+        """Return the direction of each touched wall, seen from the robot's heading [rad]."""
+        heading = self.pose()[2]
+        normals = self.data.contact.frame[:, :2].tolist()  # those of the floor are vertical
+        return [wrap_angle(math.atan2(y, x) - heading) for x, y in normals if x * x + y * y > 0.5]
+
     def wheel_travel(self) -> tuple[float, float]:
         """Return the distances [m] that the encoders of the left and right wheel have counted."""
         left, right = self._qpos.item(self._left_wheel), self._qpos.item(self._right_wheel)

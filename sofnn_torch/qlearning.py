@@ -21,6 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from sofnn_torch.replay import ReplayMemory
 from sofnn_torch.sofnn import SOFNN
 
 Coding = Literal["scalar", "wheels", "onehot", "antecedent"]
@@ -55,6 +56,9 @@ class QLearning:
         rate_constant: learning rate of c.
         rate_centre: learning rate of the centres.
         rate_width: learning rate of the widths.
+        replays: batches of remembered decisions that the consequents learn from again at the
+            beginning of each trial; 0 for none.
+        memory: decisions that are remembered.
         seed: seed of the roulette and of the action inside a segment.
 
     Raises:
@@ -76,10 +80,12 @@ class QLearning:
         trace_cut: bool = True,
         trace_limit: float | None = 1.0,
         rate_state: float = 0.0,
-        rate_action: float = 0.5,
-        rate_constant: float = 0.5,
+        rate_action: float = 1.0,
+        rate_constant: float = 0.0,
         rate_centre: float = 0.0,
         rate_width: float = 0.0,
+        replays: int = 0,
+        memory: int = 20_000,
         seed: int = 0,
     ):
         length = code_length(coding, segments)
@@ -99,9 +105,15 @@ class QLearning:
         self.rng = np.random.default_rng(seed)
         self.antecedents = rate_centre > 0 or rate_width > 0
         rates = [rate_state] * n_states + [rate_action] * length + [rate_constant]
+        consequent_rates = rates
         if self.antecedents:
             rates = [rate_centre] * net.n_inputs + [rate_width] * net.n_inputs + rates
         self.rates = net.default_width.new_tensor(rates)[:, None]
+        self.replays, self.replay_rates = replays, self.rates[-len(consequent_rates) :]
+        if replays:
+            fields = {"features": net.n_outputs, "reward": 0, "goes_on": 0, "following": n_states}
+            self.memory = ReplayMemory(fields, memory, net.default_width.cpu().numpy().dtype)
+        self.features: list[float] = []  # (x, a, 1) of the last decision
         ends = [-1 + 2 * j / segments for j in range(segments + 1)]
         self.edges = list(pairwise(ends))
         middles = [(low + high) / 2 for low, high in self.edges]
@@ -116,6 +128,8 @@ class QLearning:
     def start(self, observation: np.ndarray) -> int | np.ndarray:
         """Begin a trial at the observation (n,): clear the traces, choose the first action."""
         self.net.traces.zero_()
+        if self.replays and len(self.memory):
+            self._replay()
         x = self._tensor(observation)
         return self._choose(x, self._firing(x))
 
@@ -123,10 +137,12 @@ class QLearning:
         self, reward: float, observation: np.ndarray, terminated: bool
     ) -> int | np.ndarray | None:
         """Learn from the reward of the last action, then choose the next (None at the end)."""
-        x = self._tensor(observation)
+        if self.replays:
+            self.memory.add([*self.features, reward, not terminated, *observation.tolist()])
         if terminated:
             self._learn(reward - self.value)
             return None
+        x = self._tensor(observation)
         firing = self._firing(x)
         following = max(self.action_values(x, firing).tolist())
         self._learn(reward + self.gamma * following - self.value)
@@ -156,19 +172,32 @@ class QLearning:
     def state_dict(self) -> dict:
         """Everything that the future depends on, as tensors, numbers and text."""
         rng = self.rng.bit_generator.state
-        return {"net": self.net.state_dict(), "rng": rng, "value": self.value}
+        state = {"net": self.net.state_dict(), "rng": rng, "value": self.value}
+        return state | ({"memory": self.memory.state_dict()} if self.replays else {})
 
     def load_state_dict(self, state: dict) -> None:
         """Counterpart of `state_dict`; a fresh learner takes the size of the stored network."""
         self.net.load_state_dict(state["net"])
         self.rng.bit_generator.state = state["rng"]
         self.value = state["value"]
+        if self.replays:
+            self.memory.load_state_dict(state["memory"])
 
     def action_values(self, x: Tensor, firing: Tensor) -> Tensor:
-        """Q(x, a_j) of every segment (eq. 10) from the firing (.., K). Shape: (J,)."""
-        conclusions = firing @ self.net.consequents  # (m,), (1, m) or (J, m)
-        features = torch.cat([x.expand(self.segments, -1), self.tails], 1)  # (J, m)
-        return (features * conclusions).sum(1)
+        """Q(x, a_j) of every segment (eq. 10).
+
+        Args:
+            x: state, or many. Shape: (n,) or (B, n).
+            firing: normalised firing at ``_inputs(x)``.
+
+        Returns:
+            Shape: (J,) or (B, J).
+        """
+        conclusions = firing @ self.net.consequents
+        if self.coding != "antecedent":
+            conclusions = conclusions.unsqueeze(-2)  # the same for every action
+        features = torch.cat(self._beside(x, self.tails), -1)
+        return (features * conclusions).sum(-1)
 
     def _firing(self, x: Tensor) -> Tensor:
         """Normalised firing at x: (K,), or (J, K) if the action is an antecedent."""
@@ -190,7 +219,8 @@ class QLearning:
         scalar = self.representatives[segment] if self.actions == "three" else inside
         # The paper draws the action inside the segment also where the robot only has three.
         code = self._code(segment, inside if self.coding == "scalar" else scalar)
-        features = x.new_tensor([*x.tolist(), *code, 1.0])
+        self.features = [*x.tolist(), *code, 1.0]
+        features = x.new_tensor(self.features)
         if self.coding == "antecedent":
             x = features[: self.n + 1]
             firing = net.observe(x)
@@ -213,6 +243,23 @@ class QLearning:
         self._log["error"].append(error)
         self.net.adapt(self.rates, error)
 
+    def _replay(self) -> None:
+        """Equations 12-15 for batches of remembered decisions; the antecedents stay."""
+        net = self.net
+        for _ in range(self.replays):
+            seen = self.memory.sample(self.rng, self.rates)
+            features, following = seen["features"], seen["following"]
+            with torch.no_grad():
+                best = self.action_values(
+                    following, net.normalised_firing(self._inputs(following))
+                ).amax(-1)
+                firing = net.normalised_firing(features[:, : net.n_inputs])
+            consequents = net.learnable(antecedents=False)
+            value = (features * (firing @ consequents.T)).sum(1)
+            error = seen["reward"] + self.gamma * seen["goes_on"] * best - value.detach()
+            (gradient,) = torch.autograd.grad(value, consequents, error)
+            net.adapt_batch(self.replay_rates, gradient, features.abs().T @ firing)
+
     def _roulette(self, values: list[float]) -> int:
         """A segment drawn with the probabilities of equation 11."""
         best = max(values)
@@ -230,10 +277,15 @@ class QLearning:
         return [scalar]
 
     def _inputs(self, x: Tensor) -> Tensor:
-        """Network inputs: the state (1, n), or with every action (J, n + 1)."""
+        """Network inputs at states (.., n): the same, or with every action (.., J, n + 1)."""
         if self.coding != "antecedent":
-            return x[None]
-        return torch.cat([x.expand(self.segments, -1), self.codes], 1)
+            return x
+        return torch.cat(self._beside(x, self.codes), -1)
+
+    def _beside(self, x: Tensor, codes: Tensor) -> tuple[Tensor, Tensor]:
+        """States (.., n) and codes (J, c), repeated so that each stands beside each."""
+        shape = (*x.shape[:-1], self.segments, -1)
+        return x.unsqueeze(-2).expand(shape), codes.expand(shape)
 
     def _tensor(self, observation: np.ndarray) -> Tensor:
         return torch.from_numpy(observation).to(self.rates)

@@ -20,6 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from sofnn_torch.replay import ReplayMemory
 from sofnn_torch.sofnn import SOFNN
 
 Actions = Literal["three", "steer", "wheels"]
@@ -65,10 +66,14 @@ class SGA:
         sigma_min: lower bound of sigma.
         sigma_max: upper bound of sigma.
         mean_limit: bound of the absolute value of mu.
+        replays: batches of remembered decisions that the consequents learn from again at the
+            beginning of each trial; 0 for none. Needs the learned baseline.
+        memory: decisions that are remembered.
         seed: seed of the action sampling.
 
     Raises:
-        ValueError: the network has another number of outputs, or the bounds are not ordered.
+        ValueError: the network has another number of outputs, the bounds are not ordered, or
+            replays lack the learned baseline.
     """
 
     def __init__(
@@ -90,6 +95,8 @@ class SGA:
         sigma_min: float = 0.03,
         sigma_max: float = 1.0,
         mean_limit: float = 1.0,
+        replays: int = 0,
+        memory: int = 20_000,
         seed: int = 0,
     ):
         m = n_actions(actions)
@@ -100,6 +107,8 @@ class SGA:
             )
         if not 0 < sigma_min <= sigma_max:
             raise ValueError(f"need 0 < sigma_min <= sigma_max, got {sigma_min} and {sigma_max}")
+        if replays and not learned:
+            raise ValueError("replays need the learned baseline: without it set replays to 0")
         self.net, self.actions, self.m = net, actions, m
         self.gamma, self.decay, self.learned, self.constant = (
             gamma,
@@ -118,13 +127,21 @@ class SGA:
             rates = [rate_centre * scale] * n + [rate_width * scale] * n + rates
         self.rates = net.default_width.new_tensor(rates)[:, None]
         self.parts = (m, m, 1) if learned else (m, m)  # outputs mu, sigma and value
-        self.unit = self.rates.new_ones(1)
+        self.replays, self.replay_rates = replays, self.rates[-net.n_outputs :]
+        if replays:
+            n = net.n_inputs
+            fields = {"state": n, "action": m, "surprise": 0}
+            fields |= {"reward": 0, "goes_on": 0, "following": n}
+            self.memory = ReplayMemory(fields, memory, net.default_width.cpu().numpy().dtype)
+        self.decision: list[float] = []  # state, action and its surprise
         self.value = 0.0
         self._log = {"mu": [], "sigma": [], "error": [], "firing": []}
 
     def start(self, observation: np.ndarray) -> int | np.ndarray:
         """Begin a trial at the observation (n,): clear the traces, choose the first action."""
         self.net.traces.zero_()
+        if self.replays and len(self.memory):
+            self._replay()
         x = self._tensor(observation)
         return self._choose(x, self.net.observe(x))
 
@@ -132,10 +149,12 @@ class SGA:
         self, reward: float, observation: np.ndarray, terminated: bool
     ) -> int | np.ndarray | None:
         """Learn from the reward of the last action, then choose the next (None at the end)."""
-        x = self._tensor(observation)
+        if self.replays:
+            self.memory.add([*self.decision, reward, not terminated, *observation.tolist()])
         if terminated:
             self._learn(reward - self.value if self.learned else reward - self.constant)
             return None
+        x = self._tensor(observation)
         firing = self.net.observe(x)
         error = reward - self.constant
         if self.learned:
@@ -169,13 +188,16 @@ class SGA:
     def state_dict(self) -> dict:
         """Everything that the future depends on, as tensors, numbers and text."""
         rng = self.rng.bit_generator.state
-        return {"net": self.net.state_dict(), "rng": rng, "value": self.value}
+        state = {"net": self.net.state_dict(), "rng": rng, "value": self.value}
+        return state | ({"memory": self.memory.state_dict()} if self.replays else {})
 
     def load_state_dict(self, state: dict) -> None:
         """Counterpart of `state_dict`; a fresh learner takes the size of the stored network."""
         self.net.load_state_dict(state["net"])
         self.rng.bit_generator.state = state["rng"]
         self.value = state["value"]
+        if self.replays:
+            self.memory.load_state_dict(state["memory"])
 
     def _choose(self, x: Tensor, firing: Tensor) -> int | np.ndarray:
         """Sample an action (eq. 5) and add its eligibility to the traces (eq. 6)."""
@@ -197,6 +219,11 @@ class SGA:
             # With fixed antecedents the last output has the same gradient, and a cheaper graph.
             objective = objective + (state_value if self.antecedents else value[0])
         net.accumulate(torch.autograd.grad(objective, parameters)[0], self.decay)
+        if self.replays:
+            unlikely = sum(
+                math.log(s) + z * z / 2 for s, z in zip(sigma.tolist(), noise, strict=True)
+            )
+            self.decision = [*x.tolist(), *action.tolist(), unlikely]
         self._log["mu"] += mu.tolist()
         self._log["sigma"] += sigma.tolist()
         self._log["firing"].append(net.max_firing)
@@ -204,11 +231,36 @@ class SGA:
 
     def _learn(self, error: float) -> None:
         """Equations 7 and 8 for the reinforcement error r - b, then the bounds of mu and sigma."""
-        net, m = self.net, self.m
         self._log["error"].append(error)
-        net.adapt(self.rates, error)
-        net.clamp_consequents(0, m, -self.mean_limit, self.mean_limit)
-        net.clamp_consequents(m, 2 * m, self.sigma_min, self.sigma_max)
+        self.net.adapt(self.rates, error)
+        self._bound()
+
+    def _bound(self) -> None:
+        self.net.clamp_consequents(0, self.m, -self.mean_limit, self.mean_limit)
+        self.net.clamp_consequents(self.m, 2 * self.m, self.sigma_min, self.sigma_max)
+
+    def _replay(self) -> None:
+        """Equations 5-8 without traces for batches of remembered decisions; the antecedents stay.
+
+        Another policy took them: each counts min(1, pi(a | x) now / then) (Wawrzynski, Neural
+        Networks 22, 2009; Espeholt et al., ICML 2018).
+        """
+        net = self.net
+        for _ in range(self.replays):
+            seen = self.memory.sample(self.rng, self.rates)
+            with torch.no_grad():
+                firing = net.normalised_firing(seen["state"])
+                ahead = net.normalised_firing(seen["following"]) @ net.consequents[:, -1]
+            consequents = net.learnable(antecedents=False)
+            mean, deviation, value = (firing @ consequents.T).split_with_sizes(self.parts, 1)
+            unexpected, value = surprise(seen["action"], mean, deviation), value[:, 0]
+            ratio = (seen["surprise"] - unexpected.detach().sum(1)).exp().clamp(max=1.0)
+            error = seen["reward"] + self.gamma * seen["goes_on"] * ahead - value.detach()
+            weights = deviation.detach().square() if self.variance_scaled else 1.0
+            objective = value - (weights * unexpected).sum(1)
+            (gradient,) = torch.autograd.grad(objective, consequents, ratio * error)
+            net.adapt_batch(self.replay_rates, gradient, ratio @ firing)
+            self._bound()
 
     def _tensor(self, observation: np.ndarray) -> Tensor:
         return torch.from_numpy(observation).to(self.rates)

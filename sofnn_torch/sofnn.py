@@ -396,6 +396,20 @@ class SOFNN(nn.Module):
         if parameters is self._active:
             self._widths.clamp_(min=self.min_width)
 
+    def adapt_batch(self, rates: Tensor, gradient: Tensor, mass: Tensor) -> None:
+        """W <- W + rates gradient / max(1, mass) for a gradient summed over a batch of states.
+
+        Dividing by the firing behind the sum makes a consequent move by the mean over the states
+        that it answers for, however many of them are in the batch.
+
+        Args:
+            rates: learning rate of each row. Shape: (rows, 1).
+            gradient: of the last rows of the table, as many as it has. Shape: (rows, K).
+            mass: summed firing that the gradient of a consequent holds. Shape: (K,) or (rows, K).
+        """
+        parameters, _ = self._learning[gradient.shape[0]]
+        parameters.add_(rates * gradient / mass.clamp(min=1.0))
+
     def clamp_consequents(self, first: int, last: int, low: float, high: float) -> None:
         """Keep the consequents first..last-1 of every rule between low and high."""
         self._consequents[first:last].clamp_(low, high)

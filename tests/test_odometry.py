@@ -8,6 +8,7 @@ import pytest
 
 from sofnn_torch.maze import LEFT, RIGHT, STRAIGHT, KheperaMazeEnv
 from sofnn_torch.odometry import (
+    DRAG,
     DeadReckoning,
     MotorNoise,
     advance,
@@ -63,13 +64,13 @@ def test_dead_reckoning_by_hand():
     estimator = DeadReckoning()
     estimator.fix((0.15, 0.25, 0.0))
     for _ in range(10):
-        estimator.update(0.005, 0.005, False)
+        estimator.update(0.005, 0.005)
     assert estimator.pose == pytest.approx((0.2, 0.25, 0.0))
     for _ in range(10):
-        estimator.update(-0.002, 0.002, False)
+        estimator.update(-0.002, 0.002)
     assert estimator.pose == pytest.approx((0.2, 0.25, 0.8))
     for _ in range(10):
-        estimator.update(0.005, 0.005, False)
+        estimator.update(0.005, 0.005)
     x, y = 0.2 + 0.05 * math.cos(0.8), 0.25 + 0.05 * math.sin(0.8)
     assert estimator.pose == pytest.approx((x, y, 0.8))
 
@@ -82,22 +83,55 @@ def test_dead_reckoning_follows_an_arc():
     assert pose == pytest.approx((0.6, 0.6, QUARTER), abs=1e-5)
 
 
-def test_a_guarded_estimate_waits_at_walls_and_stays_inside():
-    estimator = DeadReckoning("guarded", arena=(1.0, 0.8))
+@pytest.mark.parametrize("mode", ["guarded", "still"])
+def test_an_estimate_waits_at_walls_and_stays_inside(mode):
+    estimator = DeadReckoning(mode, arena=(1.0, 0.8))
     estimator.fix((0.5, 0.5, 0.0))
-    estimator.update(0.005, 0.005, True)
-    assert estimator.pose == (0.5, 0.5, 0.0)
-    estimator.update(-0.002, 0.002, True)  # a robot at a wall still turns
+    estimator.update(0.005, 0.005, [0.0])
+    assert estimator.pose == pytest.approx((0.5, 0.5, 0.0))
+    estimator.update(-0.002, 0.002, [0.0])  # a robot at a wall still turns
     assert estimator.pose == pytest.approx((0.5, 0.5, 0.08))
     estimator.fix((0.999, 0.799, 0.25 * math.pi))
-    estimator.update(0.005, 0.005, False)
+    estimator.update(0.005, 0.005)
     assert estimator.pose[:2] == (1.0, 0.8)
+
+
+def test_an_estimate_slides_along_a_wall():
+    estimator = DeadReckoning("guarded")
+    estimator.fix((0.5, 0.5, 0.25 * math.pi))  # to the north-east, against a wall in the east
+    estimator.update(0.005, 0.005, [-0.25 * math.pi])
+    way = 0.005 * math.sqrt(0.5) / (0.5 + 0.5 * DRAG)
+    assert estimator.pose == pytest.approx((0.5, 0.5 + way, 0.25 * math.pi))
+    before = estimator.pose
+    estimator.update(0.005, 0.005, [-0.25 * math.pi, -0.25 * math.pi])  # two pieces of one wall
+    assert estimator.pose[1] - before[1] == pytest.approx(way)
+    estimator.update(0.005, 0.005, [-0.25 * math.pi, 0.25 * math.pi])  # a corner
+    estimator.update(-0.005, -0.005, [0.0])  # away from the wall
+    x, y = 0.5 - 0.005 * math.sqrt(0.5), 0.5 + 2 * way - 0.005 * math.sqrt(0.5)
+    assert estimator.pose[:2] == pytest.approx((x, y))
+
+
+@pytest.mark.parametrize("bearing", [0.1, 0.3, 0.5, 0.7, 0.9, 1.1, 1.3])
+@pytest.mark.parametrize("side", [-1, 1])
+def test_the_robot_slides_as_its_estimate_does(bearing, side):
+    env = KheperaMazeEnv(motor_noise=0.0)
+    env.reset(seed=0, options={"pose": (0.5, 0.0276, -QUARTER + side * (QUARTER - bearing))})
+    env.step(STRAIGHT)
+    env.estimator.fix(env.physics.pose())
+    begin = env.physics.position()
+    for _ in range(10):
+        info = env.step(STRAIGHT)[4]
+        assert info["collision"] and info["steps"] == 1
+    x, y, _ = info["estimated_pose"] - info["true_pose"]
+    slid = math.dist(begin, info["true_pose"][:2])
+    assert slid > 0.001
+    assert math.hypot(x, y) < 0.002 + 0.04 * slid  # standing still it would be wrong by all of it
 
 
 def test_a_literal_estimate_always_moves():
     estimator = DeadReckoning("literal")
     estimator.fix((0.999, 0.5, 0.0))
-    estimator.update(0.005, 0.005, True)
+    estimator.update(0.005, 0.005, [0.0])
     assert estimator.pose == pytest.approx((1.004, 0.5, 0.0))
 
 
@@ -107,7 +141,7 @@ def visit(env, place):
     return env.step(LEFT)[4]
 
 
-@pytest.mark.parametrize("mode", ["guarded", "literal"])
+@pytest.mark.parametrize("mode", ["guarded", "still", "literal"])
 def test_landmarks_correct_the_estimate(mode):
     env = KheperaMazeEnv(dead_reckoning=mode, motor_noise=0.0)
     env.reset(seed=0)
@@ -118,7 +152,7 @@ def test_landmarks_correct_the_estimate(mode):
         error = math.dist(info["true_pose"][:2], info["estimated_pose"][:2])
         corrected.append(error < 1e-9)
     # Guarded: at every landmark, the start included. Literal: only when first found.
-    expected = {"guarded": [0, 1, 0, 1, 1], "literal": [0, 1, 0, 0, 0]}[mode]
+    expected = [0, 1, 0, 0, 0] if mode == "literal" else [0, 1, 0, 1, 1]
     assert corrected == list(map(bool, expected))
 
 

@@ -67,8 +67,12 @@ def _adapt(agent: str) -> Arm:
 # Each help of the preset `default` taken away alone; then every other number of interest.
 HELPS: dict[str, dict[str, Arm]] = {
     "sga": {
-        "no-value-baseline": {"sga.baseline": "constant"},
+        "no-replay": {"sga.replays": 0},
+        "replays-times-4": {"sga.replays": 200},
+        "no-value-baseline": {"sga.baseline": "constant", "sga.replays": 0},
         "no-optimism": {"sga.initial_value": 0.0},
+        "goal-as-optimism": {"sga.initial_value": 1.0},
+        "sigma-min-0.03": {"sga.sigma_min": 0.03},
         "no-variance-scaling": {
             "sga.variance_scaled": False,
             # The same step at the initial sigma.
@@ -88,16 +92,19 @@ HELPS: dict[str, dict[str, Arm]] = {
         "action-steer": {"sga.actions": "steer"},
     },
     "q": {
+        "no-replay": {"q.replays": 0},
+        "replays-times-4": {"q.replays": 200},
         "no-optimism": {"q.initial": 0.0},
+        "goal-as-optimism": {"q.initial": 100.0},
         "no-optimism-step-cost": {"q.initial": 0.0, "maze.step_reward": -1.0},
-        "actions-independent": {"q.rate_action": Times(2.0), "q.rate_constant": 0.0},
+        "shared-constant": {"q.rate_action": 0.5, "q.rate_constant": 0.5},
         "no-trace-cut": {"q.trace_cut": False},
         "no-trace-limit": {"q.trace_limit": None},
         "interpolation": {"net.interpolate": True},
         "coding-wheels": {"q.coding": "wheels"},
         "coding-scalar": {"q.coding": "scalar"},
         "coding-antecedent": {"q.coding": "antecedent"},
-        "rates-times-0.1": {"q.rate_action": Times(0.1), "q.rate_constant": Times(0.1)},
+        "rate-times-0.1": {"q.rate_action": Times(0.1)},
         "lambda-0": {"q.trace_decay": 0.0},
         "lambda-0.5": {"q.trace_decay": 0.5},
         "lambda-0.95": {"q.trace_decay": 0.95},

@@ -1,0 +1,68 @@
+"""Experience replay: learning again from remembered decisions (Lin, Machine Learning 8, 1992)."""
+
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import DTypeLike
+from torch import Tensor
+
+BATCH = 64  # decisions that are learned from at once
+
+
+class ReplayMemory:
+    """The last decisions, each a row of numbers, in a ring.
+
+    Args:
+        fields: length of each field of a decision, 0 for a single number, e.g.
+            ``{"state": 3, "reward": 0}``.
+        capacity: decisions that are kept; a new one then takes the place of the oldest.
+        dtype: of the numbers.
+    """
+
+    def __init__(self, fields: dict[str, int], capacity: int, dtype: DTypeLike = np.float32):
+        self.fields = fields
+        self.widths = [length or 1 for length in fields.values()]
+        self.rows = np.zeros((capacity, sum(self.widths)), dtype)
+        self.count = 0  # decisions seen so far, also those that were overwritten
+
+    def __len__(self) -> int:
+        """Decisions that are remembered."""
+        return min(self.count, len(self.rows))
+
+    def add(self, numbers: list[float]) -> None:
+        """Remember a decision: the numbers of all fields in their order."""
+        self.rows[self.count % len(self.rows)] = numbers
+        self.count += 1
+
+    def sample(self, rng: np.random.Generator, like: Tensor) -> dict[str, Tensor]:
+        """A batch of decisions, drawn uniformly with replacement.
+
+        Args:
+            rng: the source of chance.
+            like: a tensor whose device and type the answer takes.
+
+        Returns:
+            Each field by name. Shape: (B, length), or (B,) for a single number.
+        """
+        rows = torch.from_numpy(self.rows[rng.integers(len(self), size=BATCH)]).to(like)
+        parts = zip(self.fields.items(), rows.split_with_sizes(self.widths, 1), strict=True)
+        return {name: part if length else part[:, 0] for (name, length), part in parts}
+
+    def state_dict(self) -> dict[str, Any]:
+        """The remembered decisions and their count."""
+        return {"rows": torch.from_numpy(self.rows[: len(self)].copy()), "count": self.count}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Counterpart of `state_dict`.
+
+        Raises:
+            ValueError: the state is of a memory of another size.
+        """
+        rows, count = state["rows"], state["count"]
+        if count < 0 or rows.shape != (min(count, len(self.rows)), self.rows.shape[1]):
+            raise ValueError(
+                f"{count} decisions of shape {tuple(rows.shape)} do not fit the memory"
+            )
+        self.rows[: len(rows)] = rows.numpy()
+        self.count = count
