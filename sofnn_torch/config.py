@@ -81,13 +81,13 @@ class SGAConfig:
     """Value of an unknown state (baseline `value`); optimistic at the start of the maze."""
     sigma_initial: float = 0.3
     """Standard deviation of the first rule, and of new rules without interpolation."""
-    sigma_min: float = 0.15
+    sigma_min: float = 0.1
     """Lower bound of sigma."""
     sigma_max: float = 1.0
     """Upper bound of sigma."""
     mean_limit: float = 1.0
     """Bound of |mu|."""
-    replays: int = 50
+    replays: int = 100
     """Batches of remembered decisions to learn from again at the beginning of each trial; 0 for
     none. Needs baseline `value`."""
     memory: int = 20_000
