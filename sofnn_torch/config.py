@@ -115,6 +115,9 @@ class QConfig:
     """Clear the traces at an action that is not greedy (Watkins)."""
     trace_limit: float | None = 1.0
     """Bound of the consequents' traces; None for no bound."""
+    value_limit: float | None = 100.0
+    """Bound of the value of the following state in the TD error, the goal's reward; None for no
+    bound."""
     rate_state: float = 0.0
     """Learning rate of c_x."""
     rate_action: float = 1.0
@@ -127,7 +130,7 @@ class QConfig:
     """Learning rate of the widths v; 0 leaves them as they are."""
     initial: float = 65.0
     """Initial c of a rule, the value of an unknown state; optimistic at the start of the maze."""
-    replays: int = 50
+    replays: int = 100
     """Batches of remembered decisions to learn from again at the beginning of each trial; 0 for
     none."""
     memory: int = 20_000
@@ -242,6 +245,7 @@ def _paper(agent: str, network: str) -> Config:
         trace_decay=0.0,
         trace_cut=False,
         trace_limit=None,
+        value_limit=None,
         rate_state=0.1,
         rate_action=0.1,
         rate_constant=0.1,

@@ -51,6 +51,7 @@ class QLearning:
         trace_decay: lambda; the paper has 0.
         trace_cut: clear the traces when the chosen segment is not the greedy one (Watkins).
         trace_limit: bound of the consequents' traces, None for no bound.
+        value_limit: no following value in equations 12 and 13 counts for more; None for no bound.
         rate_state: learning rate of c_x.
         rate_action: learning rate of c_a.
         rate_constant: learning rate of c.
@@ -79,6 +80,7 @@ class QLearning:
         trace_decay: float = 0.8,
         trace_cut: bool = True,
         trace_limit: float | None = 1.0,
+        value_limit: float | None = None,
         rate_state: float = 0.0,
         rate_action: float = 1.0,
         rate_constant: float = 0.0,
@@ -102,6 +104,7 @@ class QLearning:
         self.net, self.n, self.actions, self.coding = net, n_states, actions, coding
         self.segments, self.temperature, self.gamma = segments, temperature, gamma
         self.decay, self.trace_cut, self.trace_limit = gamma * trace_decay, trace_cut, trace_limit
+        self.value_limit = math.inf if value_limit is None else value_limit
         self.rng = np.random.default_rng(seed)
         self.antecedents = rate_centre > 0 or rate_width > 0
         rates = [rate_state] * n_states + [rate_action] * length + [rate_constant]
@@ -144,7 +147,7 @@ class QLearning:
             return None
         x = self._tensor(observation)
         firing = self._firing(x)
-        following = max(self.action_values(x, firing).tolist())
+        following = min(max(self.action_values(x, firing).tolist()), self.value_limit)
         self._learn(reward + self.gamma * following - self.value)
         return self._choose(x, self._firing(x) if self.antecedents else firing)
 
@@ -250,10 +253,9 @@ class QLearning:
             seen = self.memory.sample(self.rng, self.rates)
             features, following = seen["features"], seen["following"]
             with torch.no_grad():
-                best = self.action_values(
-                    following, net.normalised_firing(self._inputs(following))
-                ).amax(-1)
                 firing = net.normalised_firing(features[:, : net.n_inputs])
+                ahead = net.normalised_firing(self._inputs(following))
+                best = self.action_values(following, ahead).amax(-1).clamp(max=self.value_limit)
             consequents = net.learnable(antecedents=False)
             value = (features * (firing @ consequents.T)).sum(1)
             error = seen["reward"] + self.gamma * seen["goes_on"] * best - value.detach()

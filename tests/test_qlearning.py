@@ -108,6 +108,19 @@ def test_one_step_is_the_semi_gradient_update_with_the_brute_force_maximum():
     torch.testing.assert_close(agent.net.table().detach(), expected)
 
 
+@pytest.mark.parametrize("beyond", [-0.1, 0.1])
+def test_no_following_value_counts_for_more_than_the_limit(beyond):
+    x, following = np.array([0.2, -0.3, 0.5]), np.array([0.3, 0.1, -2.0])
+    other = learner()
+    state = other._tensor(following)
+    best = other.action_values(state, other._firing(state)).max().item()
+    agent = learner(gamma=0.9, value_limit=best + beyond)
+    agent.start(x)
+    expected = 0.5 + 0.9 * (best + min(beyond, 0.0)) - agent.value
+    agent.step(0.5, following, False)
+    assert agent.statistics()["learning/error_rms"] == pytest.approx(abs(expected))
+
+
 @pytest.mark.parametrize("coding", CODINGS)
 def test_action_values_agree_with_rule_by_rule_sums(coding):
     agent = learner(coding)

@@ -81,11 +81,11 @@ def test_a_state_of_another_size_is_refused(rows, count):
 @pytest.mark.parametrize("coding", CODINGS)
 def test_q_replay_is_the_bounded_sum_of_semi_gradients(coding, batch):
     rates = {"rate_state": 0.1, "rate_action": 0.2, "rate_constant": 0.3}
-    agent = q_learner(coding, replays=1, gamma=0.9, **rates)
+    agent = q_learner(coding, replays=1, gamma=0.9, value_limit=0.1, **rates)
     play(agent)
     net, rows = agent.net, agent.memory.rows
     before, length = net.consequents.numpy().copy(), net.n_outputs
-    total, mass = np.zeros_like(before), np.zeros_like(before)
+    total, mass, best = np.zeros_like(before), np.zeros_like(before), []
     for i in batch:
         features, (reward, goes_on), ahead = np.split(rows[i], [length, length + 2])
         s = normalised(net, features[: net.n_inputs])
@@ -93,9 +93,11 @@ def test_q_replay_is_the_bounded_sum_of_semi_gradients(coding, batch):
         for code in agent.codes.numpy():
             f = np.concatenate([ahead, code, [1.0]])
             values.append(normalised(net, f[: net.n_inputs]) @ before @ f)
-        error = reward + 0.9 * goes_on * max(values) - s @ before @ features
+        best.append(max(values))
+        error = reward + 0.9 * goes_on * min(max(values), 0.1) - s @ before @ features
         total += error * np.outer(s, features)
         mass += np.outer(s, np.abs(features))
+    assert min(best) < 0.1 < max(best)
     rate = np.array([0.1] * 3 + [0.2] * (length - 4) + [0.3])
     assert [reward for reward in rows[:3, length]] == REWARDS and rows[2, length + 1] == 0
     agent.rng = np.random.default_rng(0)

@@ -68,7 +68,7 @@ def _adapt(agent: str) -> Arm:
 HELPS: dict[str, dict[str, Arm]] = {
     "sga": {
         "no-replay": {"sga.replays": 0},
-        "replays-times-4": {"sga.replays": 200},
+        "replays-times-0.2": {"sga.replays": 20},
         "no-value-baseline": {"sga.baseline": "constant", "sga.replays": 0},
         "no-optimism": {"sga.initial_value": 0.0},
         "goal-as-optimism": {"sga.initial_value": 1.0},
@@ -93,13 +93,14 @@ HELPS: dict[str, dict[str, Arm]] = {
     },
     "q": {
         "no-replay": {"q.replays": 0},
-        "replays-times-4": {"q.replays": 200},
+        "replays-times-0.2": {"q.replays": 20},
         "no-optimism": {"q.initial": 0.0},
         "goal-as-optimism": {"q.initial": 100.0},
         "no-optimism-step-cost": {"q.initial": 0.0, "maze.step_reward": -1.0},
         "shared-constant": {"q.rate_action": 0.5, "q.rate_constant": 0.5},
         "no-trace-cut": {"q.trace_cut": False},
         "no-trace-limit": {"q.trace_limit": None},
+        "no-value-limit": {"q.value_limit": None},
         "interpolation": {"net.interpolate": True},
         "coding-wheels": {"q.coding": "wheels"},
         "coding-scalar": {"q.coding": "scalar"},
@@ -118,6 +119,7 @@ HELPS: dict[str, dict[str, Arm]] = {
 }
 NETWORK: dict[str, Arm] = {
     "literal-dead-reckoning": {"maze.dead_reckoning": "literal"},
+    "still-dead-reckoning": {"maze.dead_reckoning": "still"},
     "theta-times-0.5": {"net.theta": Times(0.5)},
     "theta-times-1.5": {"net.theta": Times(1.5)},
     "width-times-0.7": {"net.width_position": Times(0.7), "net.width_heading": Times(0.7)},
