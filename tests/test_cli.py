@@ -359,7 +359,7 @@ def with_value(tree, place, value):
     return {**tree, head: with_value(tree[head], rest, value) if rest else value}
 
 
-@settings(max_examples=500, deadline=None)
+@settings(max_examples=600, deadline=None)
 @given(st.sampled_from(PLACES), plain | st.sampled_from(["sga", "q", "fixed", 0.5, 1, -1, 10**30]))
 @example(("net", "theta"), float("nan"))
 @example(("net", "grid"), [1, 2])
