@@ -1,13 +1,17 @@
 """A run that is killed and resumed ends as one that never stopped, to the last bit."""
 
+import contextlib
+import json
 import random
 import signal
 import time
+import urllib.request
 from dataclasses import replace
 
 import doomed
 import pytest
 from conftest import assert_same_run, quick_options, settings
+from tensorboard import program
 
 from sofnn_torch.runs import default_name
 
@@ -171,3 +175,22 @@ def test_kills_by_the_clock(case, references, tmp_path):
         assert kills < 100
     assert kills
     assert_same_end(run, reference)
+
+
+@pytest.mark.slow
+def test_tensorboard_shows_one_curve_without_doubled_steps(references, tmp_path):
+    """In the page itself, with the data server that its installation has."""
+    _, counts = references("sga estimated")
+    moment = ("decision", counts["decision"])  # in trial 12: 11 is shown, but only 10 is saved
+    run, codes = live_through("sga estimated", tmp_path, [moment])
+    files = sorted(run.glob("events.*"))
+    assert codes == [-signal.SIGKILL] and len(files) == 2
+    board = program.TensorBoard()
+    board.configure(argv=["tensorboard", "--logdir", str(tmp_path), "--port", "0"])
+    page = f"{board.launch()}data/plugin/scalars/scalars?run={run.name}&tag=trial%2Fsteps"
+    curve, deadline = [], time.monotonic() + 120
+    while len(curve) < 12 and time.monotonic() < deadline:
+        time.sleep(0.5)
+        with contextlib.suppress(OSError, ValueError):
+            curve = json.loads(urllib.request.urlopen(page).read())
+    assert [trial for _, trial, _ in curve] == [*range(1, 13)]
