@@ -1,6 +1,6 @@
 """Memory of one process over two million simulator steps of training, pictures included.
 
-    python benchmarks/soak.py --out docs/performance
+    python benchmarks/soak.py --out docs/images
 
 trains in the ordinary way, samples the process's memory, stops itself as Ctrl-C would, prints a
 table, and writes soak.json and soak.png.
@@ -91,14 +91,14 @@ def main() -> None:
 def report(samples: list[dict[str, float]], log: float, soak: Soak) -> None:
     """Print a table and write the samples and their plot."""
     columns = {name: np.array([sample[name] for sample in samples]) for name in samples[0]}
-    later = columns["steps"] > columns["steps"][-1] / 2
-    slope = np.polyfit(columns["steps"][later], columns["mebibytes"][later], 1)[0] * 1e6
     print(f"{'steps':>10} {'rules':>7} {'MiB':>7} {'files':>6} {'threads':>8}")
     for sample in samples[:: max(1, len(samples) // 10)] + samples[-1:]:
         print("{steps:10,} {rules:7,} {mebibytes:7.1f} {files:6} {threads:8}".format(**sample))
-    print(f"second half: {slope:+.2f} MiB per million steps; run directory {log:.1f} MiB")
+    for part, rows in enumerate(np.array_split(columns["mebibytes"], 4), 1):
+        print(f"quarter {part}: lowest {rows.min():.0f}, highest {rows.max():.0f} MiB")
+    print(f"run directory {log:.1f} MiB")
     soak.out.mkdir(parents=True, exist_ok=True)
-    data = {"slope": slope, "directory_mebibytes": log, "samples": samples}
+    data = {"directory_mebibytes": log, "samples": samples}
     (soak.out / f"soak-{soak.agent}.json").write_text(json.dumps(data))
     figure, (ax,) = figures.canvas(width=5, height=3)
     ax.plot(columns["steps"] / 1e6, columns["mebibytes"], label="memory of the process")

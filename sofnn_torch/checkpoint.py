@@ -15,6 +15,7 @@ import hashlib
 import io
 import os
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -159,8 +160,14 @@ def number(path: Path) -> int:
     return int(NAME.fullmatch(path.name)[1])
 
 
-def find_latest(directory: Path) -> tuple[Path, dict[str, Any], list[str]]:
+def find_latest(
+    directory: Path, check: Callable[[Path, dict[str, Any]], None] | None = None
+) -> tuple[Path, dict[str, Any], list[str]]:
     """The newest checkpoint that can be used, its state, and what is wrong with newer ones.
+
+    Args:
+        directory: of the run.
+        check: raises CheckpointError for a file and its state that cannot be used here.
 
     Raises:
         CheckpointError: there is none.
@@ -168,7 +175,10 @@ def find_latest(directory: Path) -> tuple[Path, dict[str, Any], list[str]]:
     problems = []
     for path in checkpoints(directory):
         try:
-            return path, load(path), problems
+            state = load(path)
+            if check:
+                check(path, state)
+            return path, state, problems
         except CheckpointError as error:
             problems.append(str(error))
     reason = f" ({problems[0]})" if problems else ""

@@ -11,7 +11,9 @@ import math
 import types
 import typing
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
+
+import tyro
 
 from sofnn_torch import qlearning, sga
 from sofnn_torch.maze import KheperaMazeEnv
@@ -44,7 +46,7 @@ class NetworkConfig:
     """Rules along x, y and heading of the fixed network (12 12 8 and 24 24 16 in the paper)."""
     grid_action: int = 8
     """Rules along the action of the fixed network, where the action is an antecedent."""
-    max_rules: int = 50_000
+    max_rules: Annotated[int, tyro.conf.arg(aliases=["--max-rules"])] = 50_000
     """Hard limit; beyond it no rule is added and a warning is shown."""
 
 

@@ -11,7 +11,8 @@ import numpy as np
 
 from sofnn_torch.config import Agent
 
-FARTHEST = 1e3  # metres, radians: no rule out there ever fires
+FARTHEST = 100.0  # metres, radians: no rule out there ever fires
+WIDEST = 50.0  # times the width of a new rule: it fires everywhere and no more rules are added
 LARGEST = 1e9  # no reward and no step size that make sense lead to a consequent beyond this
 WARNINGS = ("BADQPOS", "BADQVEL", "BADQACC", "BADCTRL", "CONTACTFULL", "CNSTRFULL", "INERTIA")
 
@@ -70,7 +71,7 @@ def diagnose(agent: Agent, observation: np.ndarray) -> str:
         return ""
     parts = {
         "centres": (net.centres, FARTHEST),
-        "widths": (net.widths, FARTHEST),
+        "widths": (net.widths, WIDEST * net.default_width),
         "consequents": (net.consequents, LARGEST),
         "eligibility traces": (net.traces.T, math.inf),
     }

@@ -197,16 +197,20 @@ def _home(path: Path) -> Path | None:
 
 def _choose(home: Path, path: Path, config: Config) -> tuple[Path | None, dict[str, Any] | None]:
     """The checkpoint to go on from; (None, None) if no trial was ever finished."""
-    problems: list[str] = []
+
+    def check(file: Path, state: dict[str, Any]) -> None:
+        same_settings(file, state, config)
+        checkpoint.restore(file, state, *build(config))
+
     if path != home:
-        file, state = path, checkpoint.load(path)
-    elif not checkpoint.checkpoints(home) and not (home / "trials.csv").exists():
+        state = checkpoint.load(path)
+        check(path, state)
+        return path, state
+    if not checkpoint.checkpoints(home) and not (home / "trials.csv").exists():
         return None, None
-    else:
-        file, state, problems = checkpoint.find_latest(home)
+    file, state, problems = checkpoint.find_latest(home, check)
     if problems:
         raise CheckpointError(f"{problems[0]}. To go on from the last good one: --resume {file}")
-    same_settings(file, state, config)
     return file, state
 
 

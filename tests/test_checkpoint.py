@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 
 from sofnn_torch import checkpoint, training
 from sofnn_torch.checkpoint import CheckpointError
+from sofnn_torch.cli import main
 from sofnn_torch.config import make_agent, make_env
 from sofnn_torch.runs import Run
 
@@ -113,30 +114,32 @@ def test_every_bit_of_the_header_counts(run, tmp_path):
             checkpoint.load(broken)
 
 
-def damage(data, dice):
-    """The data with a bit flipped, cut off, doubled, mixed up or overwritten somewhere."""
+def damage(data, kind, dice):
+    """The data, damaged at a random place."""
     at, length = dice.randrange(len(data)), dice.randint(1, 300)
-    kind = dice.randrange(6)
-    if kind < 2:
-        changed = bytearray(data)
-        changed[at] ^= 1 << dice.randrange(8)
-        return bytes(changed)
     return {
-        2: data[:at],
-        3: data[:at] + data[at + length :],
-        4: data[:at] + dice.randbytes(length) + data[at + length :],
-        5: data + dice.randbytes(length),
+        "flipped": data[:at] + bytes([data[at] ^ 1 << dice.randrange(8)]) + data[at + 1 :],
+        "cut off": data[:at],
+        "a part lost": data[:at] + data[at + length :],
+        "inserted": data[:at] + dice.randbytes(length) + data[at:],
+        "lengthened": data + dice.randbytes(length),
     }[kind]
 
 
-def test_six_hundred_damaged_files_are_refused(run, tmp_path):
-    data, dice = (run / "checkpoint-4.pt").read_bytes(), random.Random(0)
-    broken = tmp_path / "broken.pt"
-    for _ in range(600):
-        broken.write_bytes(damage(data, dice))
-        assert broken.read_bytes() != data
-        with pytest.raises(CheckpointError, match=r"damaged|not a checkpoint"):
-            checkpoint.load(broken)
+@pytest.mark.parametrize("kind", ["flipped", "cut off", "a part lost", "inserted", "lengthened"])
+def test_hundreds_of_damages_are_refused_and_nothing_touched(kind, copied, options):
+    newest, dice = copied / "checkpoint-4.pt", random.Random(kind)
+    data = newest.read_bytes()
+    for count in range(500 if kind == "flipped" else 200):
+        newest.write_bytes(damaged := damage(data, kind, dice))
+        assert damaged != data
+        with pytest.raises(CheckpointError, match=r"^\S+checkpoint-4.pt: (damaged|not a ch).*$"):
+            checkpoint.load(newest)
+        if count % 40 == 0:  # what a run makes of it
+            before = contents(copied)
+            with pytest.raises(CheckpointError, match=r"^\S+: .* --resume \S+checkpoint-2.pt$"):
+                training.resume(copied, options, trials=6)
+            assert contents(copied) == before
 
 
 @pytest.mark.parametrize(
@@ -271,12 +274,41 @@ def test_without_a_good_checkpoint_nothing_is_touched(copied, options):
     assert contents(copied) == before
 
 
-def test_a_checkpoint_of_other_settings_is_refused(copied, options, tmp_path):
-    other = training.train(settings(net={"theta": 0.5}), quick_options(tmp_path / "other"))
-    shutil.copy(other / "checkpoint-4.pt", copied / "checkpoint-6.pt")
+@pytest.fixture(scope="module")
+def unusable(run, state, tmp_path_factory):
+    """Files that are no checkpoint for the run, and what the refusal says."""
+    place = tmp_path_factory.mktemp("unusable")
+    data = (run / "checkpoint-4.pt").read_bytes()
+    (place / "truncated").write_bytes(data[:-1])
+    (place / "empty").write_bytes(b"")
+    torch.save({"model": torch.zeros(3)}, place / "foreign")
+    rewrite(place / "future", state, version=checkpoint.VERSION + 1)
+    rewrite(place / "other shapes", edited(state, ("agent", "net", "blocks.0"), torch.zeros(2, 2)))
+    other = training.train(settings(net={"theta": 0.5}), quick_options(place / "other"))
+    shutil.copy(other / "checkpoint-4.pt", place / "other settings")
+    return place
+
+
+@pytest.mark.parametrize(
+    "kind,message",
+    [
+        ("truncated", "damaged or cut off"),
+        ("empty", "not a checkpoint of sofnn-torch"),
+        ("foreign", "not a checkpoint of sofnn-torch"),
+        ("future", "update sofnn-torch"),
+        ("other shapes", "does not fit its settings"),
+        ("other settings", "other settings (net.theta 0.5, here 0.4)"),
+    ],
+)
+def test_an_unusable_file_gets_one_line_that_offers_the_last_good_one(
+    kind, message, unusable, copied, capsys
+):
+    shutil.copy(unusable / kind, copied / "checkpoint-6.pt")
     before = contents(copied)
-    with pytest.raises(CheckpointError, match=r"other settings \(net\.theta 0\.5, here"):
-        training.resume(copied, options, trials=9)
+    assert main(["--resume", str(copied), "--trials", "9", "--quiet"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("error: ") and message in line
+    assert f"--resume {copied / 'checkpoint-4.pt'}" in line
     assert contents(copied) == before
 
 
@@ -304,6 +336,25 @@ def test_a_failed_write_leaves_the_old_file(failing, state, tmp_path, monkeypatc
     with pytest.raises(OSError, match="No space left"):
         checkpoint.save(path, state | {"trial": 99})
     assert contents(tmp_path) == before
+
+
+def test_a_file_is_on_the_disk_before_it_takes_its_name(state, tmp_path, monkeypatch):
+    path, calls = tmp_path / "checkpoint-1.pt", []
+    real = {name: getattr(os, name) for name in ("fsync", "replace")}
+
+    def fsync(descriptor):
+        calls.append(("fsync", os.path.samestat(os.fstat(descriptor), os.stat(tmp_path))))
+        real["fsync"](descriptor)
+
+    def replace(source, target):
+        assert not path.exists() and checkpoint.load(source)
+        calls.append(("replace", target == path))
+        real["replace"](source, target)
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    monkeypatch.setattr(os, "replace", replace)
+    checkpoint.save(path, state)
+    assert calls == [("fsync", False), ("replace", True), ("fsync", True)]  # True: the directory
 
 
 @trials_of(max_examples=100, deadline=None)

@@ -135,6 +135,39 @@ def test_divergence_is_one_line_and_exit_code_1(here, capsys):
     assert main(["--replay", str(file)]) == 1
 
 
+RATES = [f"sga.rate-{name}" for name in ("mean", "deviation", "value", "centre", "width")]
+RATES += [f"q.rate-{name}" for name in ("state", "action", "constant", "centre", "width")]
+
+
+@pytest.mark.parametrize("rate", RATES)
+def test_a_learning_rate_of_a_thousand_ends_in_a_message(rate, here, capsys):
+    words = ["--agent", rate.partition(".")[0], f"--{rate}", "1e3", "--trials", "12", *QUICK]
+    assert main([*words, "--maze.max-steps=2000"]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert re.match(r"error: trial \d+ diverged: .*(rules, as in rule|times its range)", line)
+    (file,) = Path("runs").rglob("divergence-*.pt")
+    assert main(["--replay", str(file)]) == 1
+    assert checkpoint.load(file)["reason"] in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("agent", ["sga", "q"])
+@pytest.mark.parametrize("preset", ["default", "paper"])
+def test_the_presets_stay_within_the_limits_of_the_guard(agent, preset, here, capsys):
+    words = ["--agent", agent, "--preset", preset, "--trials", "3", *QUICK]
+    assert main([*words, "--maze.max-steps=2000"]) == 0
+    assert not capsys.readouterr().err
+
+
+@pytest.mark.parametrize("agent", ["sga", "q"])
+def test_growth_without_end_stops_at_the_limit_and_says_so(agent, here, capsys):
+    words = ["--agent", agent, "--net.theta", "0.999", "--max-rules", "50", "--trials", "2", *QUICK]
+    assert main([*words, "--maze.max-steps=500"]) == 0
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line == "warning: 50 rules reached (--net.max-rules): no more are added"
+    (run,) = Path("runs").iterdir()
+    assert checkpoint.find_latest(run)[1]["network"]["rules"] == 50
+
+
 # -------------------------------------------------------------------------------------- bad input
 
 
@@ -161,7 +194,9 @@ def test_divergence_is_one_line_and_exit_code_1(here, capsys):
         ("--net.theta inf", "--net.theta must be a finite number"),
         ("--net.width-position 0", "--net.width-position must be positive"),
         ("--net.width-heading -1", "--net.width-heading must be positive"),
-        ("--net.width-position 1e-6", "width"),
+        ("--net.width-position 1e-6", "every width must be at least 0.001"),
+        ("--net.width-heading 1e-6", "every width must be at least 0.001"),
+        ("--agent q --q.coding antecedent --net.width-action 1e-6", "every width must be at least"),
         ("--net.max-rules 0", "--net.max-rules must be positive"),
         ("--net.grid 4 4", "--net.grid"),
         ("--network fixed --net.grid 999 999 999", "--net.max-rules"),
@@ -324,7 +359,7 @@ def with_value(tree, place, value):
     return {**tree, head: with_value(tree[head], rest, value) if rest else value}
 
 
-@settings(max_examples=500, deadline=None)
+@settings(max_examples=600, deadline=None)
 @given(st.sampled_from(PLACES), plain | st.sampled_from(["sga", "q", "fixed", 0.5, 1, -1, 10**30]))
 @example(("net", "theta"), float("nan"))
 @example(("net", "grid"), [1, 2])

@@ -1,5 +1,6 @@
 """The installed package works away from the checkout: a wheel in a fresh virtual environment."""
 
+import ast
 import json
 import os
 import re
@@ -53,6 +54,21 @@ def home(wheel, tmp_path_factory):
     site = next((folder / "venv" / "lib").glob("python*")) / "site-packages"
     (site / "borrowed.pth").write_text(sysconfig.get_path("purelib") + "\n")
     return folder
+
+
+def test_files_are_data():
+    """Nothing evaluates text, unpickles, or loads a checkpoint in a way that could run code."""
+    forbidden = {"eval", "exec", "compile", "__import__", "execfile"}
+    for path in [*Path(sofnn_torch.__file__).parent.rglob("*.py"), ROOT / "train.py"]:
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Import | ast.ImportFrom):
+                names = {alias.name for alias in node.names} | {getattr(node, "module", "")}
+                assert not names & {"pickle", "marshal", "shelve", "dill", "cloudpickle"}, path
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
+                assert node.func.id not in forbidden, path
+            if isinstance(node, ast.Call) and ast.unparse(node.func) in ("torch.load", "np.load"):
+                safe = {keyword.arg: ast.unparse(keyword.value) for keyword in node.keywords}
+                assert safe.get("weights_only") == "True", f"{path}: {ast.unparse(node)}"
 
 
 def test_the_wheel_holds_the_assets_and_no_tests(wheel):

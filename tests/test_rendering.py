@@ -1,11 +1,14 @@
 """Pictures of the maze, drawn without a display."""
 
+import contextlib
 import ctypes.util
+import importlib
 import os
 import subprocess
 import sys
 
 import numpy as np
+import psutil
 import pytest
 
 from sofnn_torch import rendering
@@ -84,6 +87,50 @@ def test_the_environment_draws_itself():
     assert (env.render() != after).any()
     env.close()
     env.close()
+
+
+def open_files():
+    """Where the open files of this process lead."""
+    found = []
+    for name in os.listdir("/dev/fd"):
+        with contextlib.suppress(OSError):  # the listing's own
+            found.append(os.readlink(f"/dev/fd/{name}"))
+    return sorted(found)
+
+
+@needs_gl
+@pytest.mark.parametrize("count", [10, pytest.param(100, marks=pytest.mark.slow)])
+def test_many_mazes_that_draw_leave_nothing_behind(count, monkeypatch):
+    backend = importlib.import_module(rendering.BACKENDS[rendering.choose_backend()][0])
+    opened, freed = [], []
+
+    class Counted(backend.GLContext):
+        def __init__(self, *arguments):
+            super().__init__(*arguments)
+            opened.append(self)
+
+        def free(self):
+            super().free()
+            freed.append(self)
+
+    monkeypatch.setattr(backend, "GLContext", Counted)
+    process = psutil.Process()
+
+    def live():
+        env = KheperaMazeEnv(render_mode="rgb_array", width=32, height=32)
+        env.reset(seed=0)
+        env.step(STRAIGHT)
+        assert env.render().std() > 15
+        env.close()
+        return open_files(), process.num_threads(), process.memory_info().rss / 2**20
+
+    *before, start = live()
+    for _ in range(count - 1):
+        *after, memory = live()
+    assert len(opened) == count and freed == opened
+    assert after == before
+    # Buffers of the allowed 1,600 x 1,600 pixels: a hundred of them would be gigabytes.
+    assert memory < start + 300
 
 
 @needs_gl
