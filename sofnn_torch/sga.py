@@ -8,7 +8,8 @@ baseline, the value of the state. One decision of the learner:
     e = d ln pi(a | x) / dW,   E <- e + gamma lambda E                     (eq. 6; lambda = 1)
     W <- W + alpha (1 - gamma) (r - b) E                                   (eqs 7, 8)
 
-The gradient e comes from autograd for every w in W = {u, v, mu, sigma}. The baseline b is a
+The gradient e comes from autograd for every w in W = {u, v, mu, sigma}, seeded with the derivative
+of the normal density by mu_j and sigma_j, which saves most of the graph. The baseline b is a
 constant, as in the paper, or the change of a value V learned on the same rules by TD(lambda)
 (Kimura & Kobayashi, ICML 1998): b = V(x_t) - gamma V(x_t+1) makes r - b the TD error.
 """
@@ -36,6 +37,20 @@ def surprise(action: Tensor, mean: Tensor, deviation: Tensor) -> Tensor:
 def log_likelihood(action: Tensor, mean: Tensor, deviation: Tensor) -> Tensor:
     """Logarithm of equation 5, with sigma outside the root. Shape: that of the arguments."""
     return -surprise(action, mean, deviation) - 0.5 * math.log(2 * math.pi)
+
+
+def score(noise: list[float], sigma: list[float], scaled: bool) -> list[float]:
+    """Derivative of ln pi (eq. 5) by every mu, then by every sigma, at a = mu + noise sigma.
+
+    Args:
+        noise: standard normal number of each action.
+        sigma: standard deviation of each action.
+        scaled: multiply by sigma^2.
+    """
+    factors = sigma if scaled else [1 / s for s in sigma]
+    return [z * f for z, f in zip(noise, factors, strict=True)] + [
+        (z * z - 1) * f for z, f in zip(noise, factors, strict=True)
+    ]
 
 
 def n_actions(actions: Actions) -> int:
@@ -206,26 +221,24 @@ class SGA:
         if self.antecedents:
             *antecedents, consequents = parameters.split_with_sizes(net.parts)
             firing = net.normalised_firing(x, antecedents)
-        mean, deviation, *value = (consequents @ firing).split_with_sizes(self.parts)
-        mu, sigma = mean.detach().cpu().numpy(), deviation.detach().cpu().numpy()
+        outputs = consequents @ firing
+        numbers = outputs.tolist()
+        mu, sigma = numbers[:m], numbers[m : 2 * m]
         noise = [self.rng.standard_normal() for _ in range(m)]
-        action = mu + sigma * np.array(noise, sigma.dtype)
-        weights = -sigma * sigma if self.variance_scaled else -np.ones_like(sigma)
-        unexpected = surprise(torch.from_numpy(action).to(mean), mean, deviation)
-        objective = torch.dot(unexpected, torch.from_numpy(weights).to(mean))
+        action = np.array([u + z * s for u, z, s in zip(mu, noise, sigma, strict=True)])
+        seed = score(noise, sigma, self.variance_scaled)
         if self.learned:  # the gradient of V is the trace of TD(lambda); it moves no antecedents
-            state_value = consequents[-1] @ firing.detach()
-            self.value = state_value.item()
-            # With fixed antecedents the last output has the same gradient, and a cheaper graph.
-            objective = objective + (state_value if self.antecedents else value[0])
-        net.accumulate(torch.autograd.grad(objective, parameters)[0], self.decay)
+            self.value = numbers[-1]
+            seed.append(1.0)
+            if self.antecedents:
+                outputs = torch.cat([outputs[:-1], consequents[-1:] @ firing.detach()])
+        gradient = torch.autograd.grad(outputs, parameters, self.rates.new_tensor(seed))[0]
+        net.accumulate(gradient, self.decay)
         if self.replays:
-            unlikely = sum(
-                math.log(s) + z * z / 2 for s, z in zip(sigma.tolist(), noise, strict=True)
-            )
+            unlikely = sum(math.log(s) + z * z / 2 for s, z in zip(sigma, noise, strict=True))
             self.decision = [*x.tolist(), *action.tolist(), unlikely]
-        self._log["mu"] += mu.tolist()
-        self._log["sigma"] += sigma.tolist()
+        self._log["mu"] += mu
+        self._log["sigma"] += sigma
         self._log["firing"].append(net.max_firing)
         return self._command(action)
 

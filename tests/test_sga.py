@@ -8,7 +8,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sofnn_torch.sga import LEFT, RIGHT, SGA, STRAIGHT, log_likelihood
+from sofnn_torch.sga import LEFT, RIGHT, SGA, STRAIGHT, log_likelihood, score
 from sofnn_torch.sofnn import SOFNN
 
 N, TAU = 3, 2 * math.pi
@@ -164,6 +164,38 @@ def test_log_likelihood_is_the_normal_density():
     a, mu, sigma = torch.tensor([0.3, -1.0]), torch.tensor([0.1, 0.0]), torch.tensor([0.5, 2.0])
     expected = torch.distributions.Normal(mu, sigma).log_prob(a)
     torch.testing.assert_close(log_likelihood(a, mu, sigma), expected)
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+    noise=st.lists(st.floats(-4, 4), min_size=2, max_size=2),
+    deviation=st.lists(st.floats(0.03, 2), min_size=2, max_size=2),
+    scaled=st.booleans(),
+)
+def test_the_seed_of_the_gradient_is_the_derivative_by_autograd(noise, deviation, scaled):
+    mean = torch.tensor([0.2, -0.7], dtype=torch.float64, requires_grad=True)
+    sigma = torch.tensor(deviation, dtype=torch.float64, requires_grad=True)
+    action = (mean + sigma * torch.tensor(noise, dtype=torch.float64)).detach()
+    weight = sigma.detach().square() if scaled else 1.0
+    objective = (weight * log_likelihood(action, mean, sigma)).sum()
+    expected = torch.cat(torch.autograd.grad(objective, (mean, sigma)))
+    seed = torch.tensor(score(noise, deviation, scaled), dtype=torch.float64)
+    torch.testing.assert_close(seed, expected, rtol=1e-9, atol=1e-9)
+
+
+def test_the_traces_are_the_gradient_of_the_whole_graph():
+    agent = learner(m=2, variance_scaled=False, **ADAPTIVE)
+    x = torch.tensor([0.3, -0.2, 2.9], dtype=torch.float64)
+    agent.start(x.numpy())
+    noise = torch.from_numpy(np.random.default_rng(0).standard_normal(2))
+    table = agent.net.learnable(True)
+    *antecedents, consequents = table.split_with_sizes(agent.net.parts)
+    firing = agent.net.normalised_firing(x, antecedents)
+    mean, sigma = (consequents[:4] @ firing).split(2)
+    action = (mean + sigma * noise).detach()
+    value = consequents[-1] @ firing.detach()
+    objective = log_likelihood(action, mean, sigma).sum() + value
+    torch.testing.assert_close(agent.net.traces, torch.autograd.grad(objective, table)[0])
 
 
 @pytest.mark.parametrize(
