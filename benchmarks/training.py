@@ -32,6 +32,7 @@ from sofnn_torch.odometry import WHEEL_RADIUS
 from sofnn_torch.physics import Physics
 from sofnn_torch.session import RunOptions, Session
 
+MAX_STEPS = 2_000  # of a trial
 Commands = list[list[tuple[float, float]]]  # of both wheels [rad/s], trial by trial
 
 
@@ -44,7 +45,7 @@ def fresh(name: str, rules: int, model: mujoco.MjModel | None, trials: int) -> C
     """Return a function that begins a run in a directory."""
     config = preset(name, "sofnn", "default")
     net = dataclasses.replace(config.net, max_rules=rules + 5_000)
-    maze = dataclasses.replace(config.maze, max_steps=2_000)
+    maze = dataclasses.replace(config.maze, max_steps=MAX_STEPS)
     config = dataclasses.replace(config, trials=trials, net=net, maze=maze)
 
     def begin(runs: Path) -> Session:

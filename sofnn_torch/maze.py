@@ -17,6 +17,7 @@ __all__ = ["KheperaMazeEnv", "MazePlan", "Physics"]
 FORWARD_SPEED = 0.010  # m/s of both wheels: the paper's (10, 10) mm/s, 5 mm per step
 TURN_SPEED = 0.004  # m/s of each wheel: the paper's (-4, 4) mm/s, 0.08 rad per step
 RIGHT, STRAIGHT, LEFT = range(3)
+START, GOAL = -2, -1  # zones; the others are the numbers of sub-goals
 
 
 class KheperaMazeEnv(gymnasium.Env[np.ndarray, Any]):
@@ -103,7 +104,7 @@ class KheperaMazeEnv(gymnasium.Env[np.ndarray, Any]):
 
         self.physics = Physics(model_path)
         self.model_path, self.camera, self.width, self.height = model_path, camera, width, height
-        self.plan = self.physics.plan
+        self.plan = plan = self.physics.plan
         self.noise = MotorNoise(motor_noise, wheel_noise)
         self.estimator = DeadReckoning(
             dead_reckoning, WHEEL_BASE * wheel_base_scale, self.plan.size
@@ -120,10 +121,13 @@ class KheperaMazeEnv(gymnasium.Env[np.ndarray, Any]):
             "wheels": gymnasium.spaces.Box(-1.0, 1.0, (2,), np.float32),
         }[actions]
         self.observation_space = self._build_observation_space()
+        zones = [(i, centre, plan.subgoal_radius) for i, centre in enumerate(plan.subgoals)]
+        zones += [(START, plan.start[:2], plan.start_radius), (GOAL, plan.goal, plan.goal_radius)]
+        self._zones = [(zone, (*centre, radius * radius)) for zone, centre, radius in zones]
 
         self.total_steps = 0
         self.done = True
-        self.subgoals = [False] * len(self.plan.subgoals)
+        self.subgoals = [False] * len(plan.subgoals)
         self.trail: list[tuple[float, float]] = []
         self.on_simulator_step: Callable[[], None] | None = None  # e.g. to record each frame
         self._renderer: OffscreenRenderer | Viewer | None = None
@@ -243,26 +247,26 @@ class KheperaMazeEnv(gymnasium.Env[np.ndarray, Any]):
         self, left: float, right: float, first: float, second: float
     ) -> tuple[float, bool, bool]:
         """Simulate one step of 0.5 s; return its reward, whether it bumped and reached the goal."""
-        physics = self.physics
-        counted = physics.wheel_travel() if self.pose_mode == "odometry" else None
+        physics, scale = self.physics, self.wheel_radius_scale
+        encoders = physics.wheel_travel() if self.pose_mode == "odometry" else None
         physics.drive(*self.noise.apply(left, right, first, second))
         bumped = physics.bumped()
         x, y = physics.position()
 
-        if counted is None:
+        if encoders is None:
             rolled_left, rolled_right = left * STEP_SECONDS, right * STEP_SECONDS
         else:
             now = physics.wheel_travel()
-            rolled_left, rolled_right = now[0] - counted[0], now[1] - counted[1]
-        scale = self.wheel_radius_scale
+            rolled_left, rolled_right = now[0] - encoders[0], now[1] - encoders[1]
         walls = physics.wall_bearings() if bumped else ()
         self.estimator.update(rolled_left * scale, rolled_right * scale, walls)
 
-        found = self._find_landmarks(x, y)
-        success = _within(x, y, self.plan.goal, self.plan.goal_radius)
-        reward = self.collision_reward * bumped + self.subgoal_reward * found
-        if success:
-            reward += self.goal_reward
+        reward, success = self.collision_reward if bumped else 0.0, False
+        for zone, (centre_x, centre_y, square) in self._zones:
+            dx, dy = x - centre_x, y - centre_y
+            if dx * dx + dy * dy <= square:
+                reward += self._enter(zone)
+                success = success or zone == GOAL
         if self.render_mode is not None:
             self.trail.append((x, y))
             if self.render_mode == "human":
@@ -271,18 +275,16 @@ class KheperaMazeEnv(gymnasium.Env[np.ndarray, Any]):
             self.on_simulator_step()
         return reward, bumped, success
 
-    def _find_landmarks(self, x: float, y: float) -> int:
-        """Correct the estimate at landmarks; return how many sub-goals were found just now."""
-        plan, guarded, found = self.plan, self.estimator.guarded, 0
-        for i, subgoal in enumerate(plan.subgoals):
-            if _within(x, y, subgoal, plan.subgoal_radius):
-                if guarded or not self.subgoals[i]:
-                    self.estimator.fix(self.physics.pose())
-                found += not self.subgoals[i]
-                self.subgoals[i] = True
-        if guarded and _within(x, y, plan.start, plan.start_radius):
+    def _enter(self, zone: int) -> float:
+        """Return the reward inside a zone; correct the estimate at landmarks."""
+        if zone == GOAL:
+            return self.goal_reward
+        new = zone != START and not self.subgoals[zone]
+        if new or self.estimator.guarded:
             self.estimator.fix(self.physics.pose())
-        return found
+        if new:
+            self.subgoals[zone] = True
+        return self.subgoal_reward * new
 
     def _observation(self, bumped: bool) -> np.ndarray:
         pose = self.physics.pose() if self.pose_mode == "true" else self.estimator.pose
@@ -324,11 +326,6 @@ class KheperaMazeEnv(gymnasium.Env[np.ndarray, Any]):
         if not inside or self.plan.clearance(pose[0], pose[1]) < 0.0:
             raise ValueError(f"the robot cannot be put at {pose[:2]}: a wall is there")
         return pose
-
-
-def _within(x: float, y: float, centre: tuple[float, ...], radius: float) -> bool:
-    dx, dy = x - centre[0], y - centre[1]
-    return dx * dx + dy * dy <= radius * radius
 
 
 def _check_choice(name: str, value: Any, choices: tuple[Any, ...]) -> None:

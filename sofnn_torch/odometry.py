@@ -127,7 +127,9 @@ class DeadReckoning:
                 x += along * math.cos(heading) - aside * math.sin(heading)
                 y += along * math.sin(heading) + aside * math.cos(heading)
             heading = wrap_angle(heading + turn)
-        self.pose = (min(max(x, 0.0), self.width), min(max(y, 0.0), self.height), heading)
+        if not (0.0 <= x <= self.width and 0.0 <= y <= self.height):
+            x, y = min(max(x, 0.0), self.width), min(max(y, 0.0), self.height)
+        self.pose = (x, y, heading)
 
 
 def slide(distance: float, walls: Sequence[float]) -> tuple[float, float]:

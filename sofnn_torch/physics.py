@@ -147,7 +147,7 @@ class Physics:
 
     def pose(self) -> Pose:
         """Return x [m], y [m] and heading [rad, in [-pi, pi)] of the robot."""
-        x, y, _, *quaternion = self._qpos[:7].tolist()
+        x, y, _, *quaternion = self._qpos.tolist()[:7]
         return x, y, heading_of(*quaternion)
 
     def bumped(self) -> bool:

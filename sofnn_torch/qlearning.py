@@ -231,11 +231,12 @@ class QLearning:
         if self.antecedents:
             *antecedents, consequents = parameters.split_with_sizes(net.parts)
             firing = net.normalised_firing(x, antecedents)
-        value = features @ (consequents @ firing)
-        self.value = value.item()
+        outputs = consequents @ firing
+        self.value = (features @ outputs.detach()).item()
         greedy = values[segment] == max(values)
         decay = self.decay if greedy or not self.trace_cut else 0.0
-        net.accumulate(torch.autograd.grad(value, parameters)[0], decay, self.trace_limit)
+        gradient = torch.autograd.grad(outputs, parameters, features)[0]  # of features . outputs
+        net.accumulate(gradient, decay, self.trace_limit)
         self._log["value"].append(self.value)
         self._log["greedy"].append(greedy)
         self._log["firing"].append(net.max_firing)

@@ -24,6 +24,9 @@ import torch
 from torch import Tensor, nn
 
 Growth = Literal["rule", "input", "literal", "frozen"]
+VIEWS = {"_active", "_centres", "_widths", "_consequents", "_traces", "_consequent_traces"}
+VIEWS |= {"_usage", "_learning"}
+BATCH = 32  # states from which on one product is faster than differences state by state
 
 
 class SOFNN(nn.Module):
@@ -151,6 +154,8 @@ class SOFNN(nn.Module):
             antecedents: centres and widths, each (n, K); those of the network if None.
         """
         centres, widths = antecedents or self.table().split_with_sizes(self.parts)[:2]
+        if x.dim() == 2 and len(x) >= BATCH:
+            return (-0.5 * self._distances(x, centres, widths)).softmax(-1)
         return (-0.5 * self._squares(x, centres, widths).sum(-2)).softmax(-1)
 
     def forward(self, x: Tensor) -> Tensor:
@@ -165,12 +170,32 @@ class SOFNN(nn.Module):
     def _squares(self, x: Tensor, centres: Tensor, widths: Tensor) -> Tensor:
         """((x - u) / v)^2 for x of shape (..., n). Shape: (..., n, K)."""
         difference = x.unsqueeze(-1) - centres
+        tracked = difference.requires_grad or widths.requires_grad
         for i, frequency, period in self.wrapping:  # whole turns have no gradient
-            angle = difference.detach().select(-2, i)
+            angle = (difference.detach() if tracked else difference).select(-2, i)
             angle.sub_((angle * frequency).round_(), alpha=period)
-        if torch.is_grad_enabled():
+        if tracked:
             return (difference / widths).square()
         return difference.div_(widths).square_()  # new memory costs as much as the arithmetic
+
+    def _distances(self, x: Tensor, centres: Tensor, widths: Tensor) -> Tensor:
+        """Sum of the squares over the inputs for many states x (B, n) at once. Shape: (B, K).
+
+        Multiplied out, x^2 / v^2 - 2 x u / v^2 + u^2 / v^2 is one product of matrices. In double
+        precision its cancellation, some 1e-16 (u / v)^2, stays far below single precision.
+        """
+        wrapped = [i for i, _, _ in self.wrapping]
+        plain = [i for i in range(self.n_inputs) if i not in wrapped]
+        y, u = x[:, plain].double(), centres[plain].double()
+        precision = widths[plain].double().square().reciprocal()
+        weighted = precision * u
+        features, weights = torch.cat([y * y, y], 1), torch.cat([precision, -2 * weighted])
+        total = torch.addmm((weighted * u).sum(0), features, weights).to(x.dtype)
+        for i, frequency, period in self.wrapping:
+            angle = x[:, i, None] - centres[i]
+            angle = angle - (angle.detach() * frequency).round_() * period
+            total = total + (angle / widths[i]).square()
+        return total
 
     # ------------------------------------------------------------------------- structure, eq. 3
 
@@ -255,13 +280,12 @@ class SOFNN(nn.Module):
         if consequents is None:
             consequents = self._first_consequents(centre, log_firing)
         column = torch.cat([centre, width, consequents])
-        numbers = column.tolist()
-        widths = numbers[self.n_inputs : 2 * self.n_inputs]
-        if not all(map(math.isfinite, numbers)) or not min(widths) > 0:
+        numbers, n = column.tolist(), self.n_inputs
+        if not (math.isfinite(sum(map(abs, numbers))) and min(numbers[n : 2 * n]) > 0):
             raise ValueError(f"a rule needs finite numbers and positive widths: {numbers}")
         if k == self.capacity:
             self._append_block(max(k, self.block_size))
-        self._whole[:, k] = column
+        self._whole.select(1, k).copy_(column)
         if self.growth == "input":
             fresh = self.labels.amax(1) + 1 if k else torch.zeros_like(self.labels_store[:, 0])
             self.labels_store[:, k] = fresh if labels is None else labels
@@ -332,26 +356,31 @@ class SOFNN(nn.Module):
         self._activate(self.n_rules)
 
     def _activate(self, n_rules: int) -> None:
-        """Set the number of rules, and the views of what belongs to them.
+        """Set the number of rules; the views of what belongs to them are made when next needed."""
+        for name in VIEWS:
+            self.__dict__.pop(name, None)
+        self.__dict__["n_rules"] = n_rules  # past Module.__setattr__, which is slow
 
-        A view costs as much as arithmetic on a thousand numbers: they are made here, not in every
-        decision.
-        """
-        active, traces = self._whole[:, :n_rules], self.traces_store[:, :n_rules]
+    def __getattr__(self, name: str):
+        # A view costs as much as arithmetic on a thousand numbers: none is made twice.
+        if name not in VIEWS:
+            return super().__getattr__(name)
+        k, m = self.n_rules, self.n_outputs
+        active, traces = self._whole[:, :k], self.traces_store[:, :k]
         centres, widths, consequents = active.split_with_sizes(self.parts)
-        m = self.n_outputs
-        self.__dict__.update(  # past Module.__setattr__, which is slow
-            n_rules=n_rules,
+        last = traces[-m:]
+        self.__dict__.update(
             _active=active,
             _centres=centres,
             _widths=widths,
             _consequents=consequents,
             _traces=traces,
-            _consequent_traces=traces[-m:],
-            _usage=self.usage_store[:n_rules],
+            _consequent_traces=last,
+            _usage=self.usage_store[:k],
             # By the number of rows that learn.
-            _learning={m: (consequents, traces[-m:]), len(active): (active, traces)},
+            _learning={m: (consequents, last), len(active): (active, traces)},
         )
+        return self.__dict__[name]
 
     def _apply(self, *arguments) -> "SOFNN":
         super()._apply(*arguments)  # to another device or type, block by block

@@ -81,8 +81,31 @@ def test_angles_wrap():
 
 
 def test_batch_equals_single_states():
-    net, x = grown(), states(7, seed=2)
+    net, x = grown(), states(40, seed=2)
     torch.testing.assert_close(net(x), torch.cat([net(row[None]) for row in x]))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_batch_in_one_product_is_as_exact_as_differences(dtype):
+    net = grown(400, width=[0.01, 0.05, 0.5])
+    exact = net.log_memberships(states(64, seed=2)).sum(1)
+    centres, widths, _ = (t.to(dtype) for t in net.table().split_with_sizes(net.parts))
+    product = -0.5 * net._distances(states(64, seed=2).to(dtype), centres, widths)
+    precision = 3e4 * torch.finfo(dtype).eps  # (u / v)^2 is up to 1e4
+    near = exact > -50  # the others never fire
+    assert (product - exact)[near].abs().max() < precision
+    torch.testing.assert_close(product.double(), exact, rtol=precision, atol=precision)
+
+
+def test_the_gradient_of_a_batch_is_the_sum_of_its_states():
+    net, x = grown(), states(32, seed=3)
+    weights = torch.rand(32, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    batch = torch.autograd.grad((net(x) * weights).sum(), net.blocks[0])[0]
+    single = [
+        torch.autograd.grad((net(row[None]) * w).sum(), net.blocks[0])[0]
+        for row, w in zip(x, weights, strict=True)
+    ]
+    torch.testing.assert_close(batch, sum(single), rtol=1e-8, atol=1e-9)
 
 
 @pytest.mark.parametrize("growth", ["rule", "input", "literal"])
