@@ -7,6 +7,7 @@ from sofnn_torch import figures
 from sofnn_torch.config import make_env
 from sofnn_torch.evaluate import load
 from sofnn_torch.physics import load_model
+from sofnn_torch.policy import FrozenPolicy
 from sofnn_torch.rendering import OffscreenRenderer
 
 OUT = Path(__file__).parent / "images"
@@ -21,9 +22,9 @@ def main(run: Path) -> None:
     trail: list[tuple[float, float]] = []
     env.on_simulator_step = lambda: trail.append(env.physics.position())
     observation, _ = env.reset(seed=1000)
-    over, close_up = False, None
+    policy, over, close_up = FrozenPolicy(agent), False, None
     while not over:
-        observation, _, terminated, truncated, _ = env.step(agent.act(observation))
+        observation, _, terminated, truncated, _ = env.step(policy.act(observation))
         over = terminated or truncated
         if close_up is None and len(trail) > 120:
             close_up = renderer.draw(env.physics.data.qpos, trail, camera="chase")

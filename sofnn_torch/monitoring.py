@@ -25,6 +25,7 @@ from sofnn_torch import figures
 from sofnn_torch.config import Agent, Config, make_env
 from sofnn_torch.events import EventFile
 from sofnn_torch.physics import load_model
+from sofnn_torch.policy import FrozenPolicy
 from sofnn_torch.rendering import OffscreenRenderer
 from sofnn_torch.runs import flatten, say
 from sofnn_torch.survey import usage
@@ -275,19 +276,22 @@ def film(
         if len(trail) % steps_per_frame == 0:
             shoot()
 
+    rng, agent.rng = agent.rng, np.random.default_rng(seed)  # a film must not change the training
     try:
         env.reset(seed=seed)
+        policy = FrozenPolicy(agent, explore)
         observation, _ = env.reset()  # as in a series of trials, where only the first is seeded
         env.on_simulator_step, over = after_step, False
         shoot()
         while not over and len(trail) < limit:
-            observation, _, terminated, truncated, _ = env.step(agent.act(observation, explore))
+            observation, _, terminated, truncated, _ = env.step(policy.act(observation))
             over = terminated or truncated
             if over and len(trail) % steps_per_frame:
                 shoot()
             yield from frames
             frames.clear()
     finally:
+        agent.rng = rng
         renderer.close()
         env.close()
 

@@ -151,13 +151,24 @@ class QLearning:
         self._learn(reward + self.gamma * following - self.value)
         return self._choose(x, self._firing(x) if self.antecedents else firing)
 
-    def act(self, observation: np.ndarray, explore: bool = False) -> int | np.ndarray:
-        """The greedy action, or one by roulette; learns nothing and adds no rule."""
+    def act(self, observation: np.ndarray, explore: float = 0) -> int | np.ndarray:
+        """The greedy action, or one by roulette; learns nothing and adds no rule.
+
+        Args:
+            observation: the state. Shape: (n,).
+            explore: 0 for the greedy action, 1 for the roulette, more for one that is as many
+                times hotter.
+        """
         x = self._tensor(observation)
         with torch.no_grad():
             values = self.action_values(x, self.net.normalised_firing(self._inputs(x)))
-        segment = self._roulette(values.tolist()) if explore else int(values.argmax())
+        segment = self._roulette(values.tolist(), explore) if explore else int(values.argmax())
         return segment if self.actions == "three" else self._command(self.representatives[segment])
+
+    def strongest_rule(self, observation: np.ndarray) -> int:
+        """The rule that fires most at the state (n,)."""
+        firing = self.net.normalised_firing(self._inputs(self._tensor(observation)))
+        return int(firing.argmax()) % self.net.n_rules
 
     def statistics(self) -> dict[str, float]:
         """Means over the decisions since the last call (docs/metrics.md); starts afresh."""
@@ -263,10 +274,10 @@ class QLearning:
             (gradient,) = torch.autograd.grad(value, consequents, error)
             net.adapt_batch(self.replay_rates, gradient, features.abs().T @ firing)
 
-    def _roulette(self, values: list[float]) -> int:
+    def _roulette(self, values: list[float], hotter: float = 1) -> int:
         """A segment drawn with the probabilities of equation 11."""
-        best = max(values)
-        wheel = list(accumulate(math.exp((v - best) / self.temperature) for v in values))
+        best, temperature = max(values), self.temperature * hotter
+        wheel = list(accumulate(math.exp((v - best) / temperature) for v in values))
         ball = self.rng.random() * wheel[-1]
         return next(j for j, edge in enumerate(wheel) if ball < edge)
 

@@ -164,12 +164,22 @@ class SGA:
         self._learn(error)
         return self._choose(x, firing)
 
-    def act(self, observation: np.ndarray, explore: bool = False) -> int | np.ndarray:
-        """The mean action, or a sampled one; learns nothing and adds no rule."""
+    def act(self, observation: np.ndarray, explore: float = 0) -> int | np.ndarray:
+        """The mean action, or a sampled one; learns nothing and adds no rule.
+
+        Args:
+            observation: the state. Shape: (n,).
+            explore: 0 for the mean action, 1 for a sample of equation 5, more for one with a
+                standard deviation that is as many times larger.
+        """
         with torch.no_grad():
             outputs = self.net(self._tensor(observation)[None])[0].tolist()
         mean, sigma = np.array(outputs[: self.m]), np.array(outputs[self.m : 2 * self.m])
-        return self._command(self.rng.normal(mean, sigma) if explore else mean)
+        return self._command(self.rng.normal(mean, explore * sigma) if explore else mean)
+
+    def strongest_rule(self, observation: np.ndarray) -> int:
+        """The rule that fires most at the state (n,)."""
+        return int(self.net.normalised_firing(self._tensor(observation)).argmax())
 
     def statistics(self) -> dict[str, float]:
         """Means over the decisions since the last call (docs/metrics.md); starts afresh."""

@@ -18,6 +18,7 @@ from sofnn_torch import checkpoint, session
 from sofnn_torch.config import Agent, Config, from_dict
 from sofnn_torch.guard import Divergence, Interrupted, SignalTrap, diagnose, physics_warnings
 from sofnn_torch.monitoring import Monitor, Trajectory, TrialRecord
+from sofnn_torch.policy import FrozenPolicy
 from sofnn_torch.runs import say
 from sofnn_torch.session import RunOptions, Session, environment_seed
 from sofnn_torch.sga import SGA
@@ -44,13 +45,13 @@ def play(
         Interrupted: a signal came; the agent is in the middle of a trial then.
         Divergence: the agent, the observation or the physics diverged.
     """
-    trap = trap or SignalTrap()
+    trap, policy = trap or SignalTrap(), FrozenPolicy(agent, explore)
     observation, info = env.reset()
     true, estimated = [info["true_pose"]], [info["estimated_pose"]]
     total = collisions = decisions = 0
     over = False
     try:
-        action = agent.start(observation) if learn else agent.act(observation, explore)
+        action = agent.start(observation) if learn else policy.act(observation)
         while not over:
             if trap.number:
                 raise Interrupted(trap.number)
@@ -59,7 +60,7 @@ def play(
             if learn:
                 action = agent.step(reward, observation, terminated)
             elif not over:
-                action = agent.act(observation, explore)
+                action = policy.act(observation)
             total += reward
             decisions += 1
             collisions += info["collision"]

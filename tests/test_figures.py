@@ -78,7 +78,7 @@ def test_survey_of_sga_agrees_with_the_mean_action(actions):
 
 
 def test_a_learner_without_values_has_no_value_field(plan, axes):
-    agent = learner("sga", baseline="constant")
+    agent = learner("sga", baseline="constant", replays=0)
     assert survey(agent, STATES).value is None
     with pytest.raises(ValueError, match="baseline"):
         figures.value_field(plan, agent, axes)

@@ -225,14 +225,17 @@ def test_the_film_shows_the_trial_that_evaluation_plays(sga_trial, monkeypatch):
     config, agent, _, _ = sga_trial
     env = make_env(config)
     env.reset(seed=5)
+    agent.rng = np.random.default_rng(5)
     _, path = play(env, agent, learn=False, explore=False)
     env.close()
+    before_film = agent.rng.bit_generator.state
     monkeypatch.setattr(monitoring, "OffscreenRenderer", Camera)
     before = Camera.closed
     frames = list(film(config, agent, seed=5, steps_per_frame=4))
     assert len(frames) == 1 + 150 // 4 + 1  # the start, every fourth step, the end
     assert frames[0][0, 0] == pytest.approx(path.true[0, :2])
     assert frames[-1][0, 0] == pytest.approx(path.true[-1, :2])
+    assert agent.rng.bit_generator.state == before_film
     assert Camera.closed == before + 1
 
 

@@ -1,0 +1,35 @@
+"""A learned policy that plays a trial without learning, and does not run in circles."""
+
+from collections import Counter
+
+import numpy as np
+
+from sofnn_torch.config import Agent
+
+MOST = 10  # doublings: by then every action is about as likely
+
+
+class FrozenPolicy:
+    """The policy of a learner, for one trial.
+
+    While a robot learns, values that lead it in a circle are corrected at the second turn. Frozen
+    values are not, and a policy without chance would go on for ever. But coming back to a place
+    says that they are wrong by more than the present chance covers: so with each return to a rule
+    the roulette's temperature (eq. 11), or the standard deviation (eq. 5), is doubled at that rule
+    until the end of the trial. A policy that goes straight to the goal is not changed by this.
+
+    Args:
+        agent: the learner; only its random generator moves.
+        explore: begin with the learned stochastic policy instead of the mean or greedy action.
+    """
+
+    def __init__(self, agent: Agent, explore: bool = False):
+        self.agent, self.explore = agent, explore
+        self.visits: Counter[int] = Counter()
+
+    def act(self, observation: np.ndarray) -> int | np.ndarray:
+        """The action at an observation (n,)."""
+        rule = self.agent.strongest_rule(observation)
+        returns = min(self.visits[rule], MOST)
+        self.visits[rule] += 1
+        return self.agent.act(observation, self.explore + 2**returns - 1)
