@@ -310,6 +310,8 @@ POSITIVE |= {"trace_limit", "memory"}
 UNIT = {"gamma", "trace_decay"}  # in [0, 1]
 NOT_NEGATIVE = {"seed", "replays"}
 MOST = {"hold": 10_000, "segments": 1_000, "max_rules": 10_000_000, "memory": 10_000_000}
+# Bounds of mu and sigma would hide a rate that makes a typical step longer than their range.
+MOST |= {"rate_mean": 500, "rate_deviation": 500}
 
 
 def validate(config: Any, prefix: str = "") -> None:

@@ -25,7 +25,6 @@ from sofnn_torch.sofnn import SOFNN
 
 Actions = Literal["three", "steer", "wheels"]
 RIGHT, STRAIGHT, LEFT = 0, 1, 2
-OVERSHOOT = 1.5  # ranges, by a typical step; at the default rates it was never above 0.4
 
 
 def surprise(action: Tensor, mean: Tensor, deviation: Tensor) -> Tensor:
@@ -195,28 +194,6 @@ class SGA:
             "policy/sigma_min": sigma.min().item(),
             "learning/error_rms": error.square().mean().sqrt().item(),
         } | self.net.statistics(log["firing"])
-
-    def overshoot(self) -> str:
-        """Whether the typical step of mu or sigma in this trial leads far beyond its bounds.
-
-        The bounds would hide a learning rate that is far too large. Empty if all is well, else one
-        line; to be asked before `statistics`.
-        """
-        m, outputs = self.m, self.net.n_outputs
-        error = self.rates.new_tensor(self._log["error"] or [0.0]).square().mean().sqrt()
-        steps = (self.rates[-outputs:] * self.net.traces[-outputs:]).abs().amax(1) * error
-        ranges = {
-            "mean": (steps[:m], 2 * self.mean_limit),
-            "deviation": (steps[m:], self.sigma_max),
-        }
-        for name, (step, span) in ranges.items():
-            times = step[:m].max().item() / span
-            if times > OVERSHOOT:
-                return (
-                    f"a step of the {name} is {times:.3g} times its range at the typical error of "
-                    f"{error.item():.3g}: lower the learning rates"
-                )
-        return ""
 
     def state_dict(self) -> dict:
         """Everything that the future depends on, as tensors, numbers and text."""

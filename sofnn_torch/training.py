@@ -21,7 +21,6 @@ from sofnn_torch.monitoring import Monitor, Trajectory, TrialRecord
 from sofnn_torch.policy import FrozenPolicy
 from sofnn_torch.runs import say
 from sofnn_torch.session import RunOptions, Session, environment_seed
-from sofnn_torch.sga import SGA
 
 __all__ = ["RunOptions", "environment_seed", "play", "replay", "resume", "train"]
 
@@ -74,12 +73,7 @@ def play(
         if not isinstance(error, Divergence) and (what := diagnose(agent, observation)):
             raise Divergence(what) from error
         raise
-    what = physics_warnings(env)
-    if learn:
-        what = what or diagnose(agent, observation)
-        if isinstance(agent, SGA):  # its consequents are bounded and cannot diverge
-            what = what or agent.overshoot()
-    if what:
+    if what := physics_warnings(env) or (diagnose(agent, observation) if learn else ""):
         raise Divergence(what)
     path = Trajectory(np.array(true), np.array(estimated))
     difference = path.true - path.estimated
