@@ -6,6 +6,7 @@ import numpy as np
 
 from sofnn_torch.config import Agent
 
+PATIENCE = 3  # returns that a sound way may need: a turn, a coarse grid
 MOST = 10  # doublings: by then every action is about as likely
 
 
@@ -30,6 +31,6 @@ class FrozenPolicy:
     def act(self, observation: np.ndarray) -> int | np.ndarray:
         """The action at an observation (n,)."""
         rule = self.agent.strongest_rule(observation)
-        returns = min(self.visits[rule], MOST)
+        doublings = min(max(self.visits[rule] - PATIENCE, 0), MOST)
         self.visits[rule] += 1
-        return self.agent.act(observation, self.explore + 2**returns - 1)
+        return self.agent.act(observation, self.explore + 2**doublings - 1)
