@@ -170,6 +170,10 @@ def goals(data: Data) -> Iterator[tuple[str, str, str, str]]:
                 cell(steps, 3, 1 / optimum),
                 steps.value <= 1.1 * optimum,
             ),
-            ("trials to learn at most 50", cell(learned, limit=trials), learned.value <= min(50, trials)),
+            (
+                "trials to learn at most 50",
+                cell(learned, limit=trials),
+                learned.value <= min(50, trials),
+            ),
         ):
             yield title, text, measured, "yes" if reached else "no"
