@@ -108,11 +108,10 @@ class QLearning:
         self.rng = np.random.default_rng(seed)
         self.antecedents = rate_centre > 0 or rate_width > 0
         rates = [rate_state] * n_states + [rate_action] * length + [rate_constant]
-        consequent_rates = rates
         if self.antecedents:
             rates = [rate_centre] * net.n_inputs + [rate_width] * net.n_inputs + rates
         self.rates = net.default_width.new_tensor(rates)[:, None]
-        self.replays, self.replay_rates = replays, self.rates[-len(consequent_rates) :]
+        self.replays, self.replay_rates = replays, self.rates[-net.n_outputs :]
         if replays:
             fields = {"features": net.n_outputs, "reward": 0, "goes_on": 0, "following": n_states}
             self.memory = ReplayMemory(fields, memory, net.default_width.cpu().numpy().dtype)
