@@ -14,6 +14,8 @@ import mujoco
 import numpy as np
 import torch
 
+from sofnn_torch.session import arithmetic
+
 
 def interleaved(
     functions: dict[str, Callable[[], Any]], repeats: int = 15, seconds: float = 0.02
@@ -60,12 +62,12 @@ def median(values: np.ndarray) -> float:
 
 
 def arguments(doc: str, repeats: int, **paths: str) -> argparse.Namespace:
-    """The options of every benchmark, and paths with their help; torch runs in one thread now."""
+    """The options of every benchmark and paths with their help; sets up torch as in training."""
     parser = argparse.ArgumentParser(description=doc.splitlines()[0])
     parser.add_argument("--repeats", type=int, default=repeats)
     for name, text in {"out": "JSON file to write", **paths}.items():
         parser.add_argument(f"--{name}", type=Path, help=text)
-    torch.set_num_threads(1)
+    arithmetic().__enter__()  # until the program ends
     return parser.parse_args()
 
 

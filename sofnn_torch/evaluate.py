@@ -20,7 +20,6 @@ from typing import Annotated, Any
 
 import imageio.v2 as imageio
 import numpy as np
-import torch
 import tyro
 from rich.console import Console
 from rich.table import Table
@@ -32,6 +31,7 @@ from sofnn_torch.flags import parse
 from sofnn_torch.monitoring import TrialRecord, film, gif
 from sofnn_torch.optimum import optimal_steps
 from sofnn_torch.runs import load_config, same_settings, say, versions
+from sofnn_torch.session import arithmetic
 from sofnn_torch.training import play
 
 CONFIDENCE = 0.95
@@ -229,6 +229,7 @@ def write_video(path: Path, config: Config, agent: Agent, seed: int, explore: bo
             writer.append_data(frame)
 
 
+@arithmetic()
 def run(options: Options) -> dict[str, Estimate]:
     """What the command does.
 
@@ -236,7 +237,6 @@ def run(options: Options) -> dict[str, Estimate]:
         ValueError: the run cannot be used or a file cannot be written.
     """
     check(options)
-    torch.set_num_threads(1)
     config, agent, path, state = load(options.run, options.best)
     policy = "sampled" if options.explore else "mean" if config.agent == "sga" else "greedy"
     records = evaluate(

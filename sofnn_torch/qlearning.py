@@ -259,19 +259,18 @@ class QLearning:
 
     def _replay(self) -> None:
         """Equations 12-15 for batches of remembered decisions; the antecedents stay."""
-        net = self.net
-        for _ in range(self.replays):
-            seen = self.memory.sample(self.rng, self.rates)
-            features, following = seen["features"], seen["following"]
-            with torch.no_grad():
-                firing = net.normalised_firing(features[:, : net.n_inputs])
-                ahead = net.normalised_firing(self._inputs(following))
-                best = self.action_values(following, ahead).amax(-1).clamp(max=self.value_limit)
-            consequents = net.learnable(antecedents=False)
-            value = (features * (firing @ consequents.T)).sum(1)
-            error = seen["reward"] + self.gamma * seen["goes_on"] * best - value.detach()
-            (gradient,) = torch.autograd.grad(value, consequents, error)
-            net.adapt_batch(self.replay_rates, gradient, features.abs().T @ firing)
+        net, firing_at = self.net, self.net.firing_function()
+        seen = self.memory.sample(self.replays, self.rng, self.rates)
+        here = net.features(seen["features"][..., : net.n_inputs])
+        there = net.features(self._inputs(seen["following"]))
+        for x, ahead, *row in zip(here, there, *seen.values(), strict=True):
+            features, reward, goes_on, following = row
+            best = self.action_values(following, firing_at(ahead)).amax(-1)
+            firing, consequents = firing_at(x), net.learnable(antecedents=False)
+            value = (features.T * (consequents @ firing.T)).sum(0)
+            target = reward + self.gamma * goes_on * best.clamp_(max=self.value_limit)
+            (gradient,) = torch.autograd.grad(value, consequents, target - value.detach())
+            net.adapt_batch(self.replay_rates, gradient, features.T.abs() @ firing)
 
     def _roulette(self, values: list[float], hotter: float = 1) -> int:
         """A segment drawn with the probabilities of equation 11."""

@@ -35,19 +35,23 @@ class ReplayMemory:
         self.rows[self.count % len(self.rows)] = numbers
         self.count += 1
 
-    def sample(self, rng: np.random.Generator, like: Tensor) -> dict[str, Tensor]:
-        """A batch of decisions, drawn uniformly with replacement.
+    def sample(self, batches: int, rng: np.random.Generator, like: Tensor) -> dict[str, Tensor]:
+        """Decisions drawn uniformly with replacement.
 
         Args:
+            batches: number N of batches, each of B decisions.
             rng: the source of chance.
             like: a tensor whose device and type the answer takes.
 
         Returns:
-            Each field by name. Shape: (B, length), or (B,) for a single number.
+            Each field by name. Shape: (N, B, length), or (N, B) for a single number.
         """
-        rows = torch.from_numpy(self.rows[rng.integers(len(self), size=BATCH)]).to(like)
-        parts = zip(self.fields.items(), rows.split_with_sizes(self.widths, 1), strict=True)
-        return {name: part if length else part[:, 0] for (name, length), part in parts}
+        drawn = self.rows[rng.integers(len(self), size=(batches, BATCH))]
+        parts = torch.from_numpy(drawn).to(like).split_with_sizes(self.widths, -1)
+        return {
+            name: part if length else part[..., 0]
+            for (name, length), part in zip(self.fields.items(), parts, strict=True)
+        }
 
     def state_dict(self) -> dict[str, Any]:
         """The remembered decisions and their count."""

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -36,8 +37,8 @@ class RunOptions:
     video_every: int = 50
     """Trials from one TensorBoard video to the next; 0 for none."""
     threads: int = 1
-    """Threads of torch; one is fastest at this size. Results with several thousand rules differ in
-    their last bits between one and more."""
+    """Threads of torch; one is fastest at this size. Results with replay or with several thousand
+    rules differ in their last bits between one and more."""
     quiet: bool = False
     """No progress bar."""
 
@@ -103,13 +104,28 @@ class Session:
             self.env.close()
 
 
+@contextlib.contextmanager
+def arithmetic(threads: int = 1) -> Iterator[None]:
+    """Set torch's number of threads; inside, results below 1e-38 count as 0. Also a decorator.
+
+    Firing strengths and traces far from the state are full of such denormal numbers, for which
+    processors take many times as long.
+    """
+    flushed = bool(torch.tensor(1e-30) * 1e-10 == 0)
+    torch.set_flush_denormal(True)  # first: threads inherit it when they are made
+    torch.set_num_threads(threads)
+    try:
+        yield
+    finally:
+        torch.set_flush_denormal(flushed)
+
+
 def begin(config: Config, options: RunOptions) -> Session:
     """A new run, its settings and its state before the first trial on the disk.
 
     Raises:
         ValueError: settings or run directory cannot be used; nothing was written then.
     """
-    torch.set_num_threads(options.threads)
     agent, env = build(config)
     state = _first_state(config, agent, env)
     run = Run.create(options.runs, options.name, config, options.keep)
@@ -130,7 +146,6 @@ def reopen(path: Path, options: RunOptions, trials: int | None = None) -> Sessio
         CheckpointError: no checkpoint fits; the message names the last good one, if any.
         ValueError: settings or run directory cannot be used.
     """
-    torch.set_num_threads(options.threads)
     with contextlib.ExitStack() as undo:
         config, run, file = saved_config(path), None, path
         if home := _home(path):

@@ -14,6 +14,7 @@ constant, as in the paper, or the change of a value V learned on the same rules 
 """
 
 import math
+from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
@@ -126,6 +127,7 @@ class SGA:
             n = net.n_inputs
             rates = [rate_centre * scale] * n + [rate_width * scale] * n + rates
         self.rates = net.default_width.new_tensor(rates)[:, None]
+        self.one = self.rates.new_ones(1)
         self.parts = (m, m, 1) if learned else (m, m)  # outputs mu, sigma and value
         self.replays, self.replay_rates = replays, self.rates[-net.n_outputs :]
         if replays:
@@ -216,26 +218,28 @@ class SGA:
         if self.antecedents:
             *antecedents, consequents = parameters.split_with_sizes(net.parts)
             firing = net.normalised_firing(x, antecedents)
-        mean, deviation, *value = (consequents @ firing).split_with_sizes(self.parts)
-        mu, sigma = mean.detach().cpu().numpy(), deviation.detach().cpu().numpy()
+        outputs = consequents @ firing
+        numbers = outputs.tolist()
+        mu, sigma = numbers[:m], numbers[m : 2 * m]
         noise = [self.rng.standard_normal() for _ in range(m)]
-        action = mu + sigma * np.array(noise, sigma.dtype)
-        weights = -sigma * sigma if self.variance_scaled else -np.ones_like(sigma)
-        unexpected = surprise(torch.from_numpy(action).to(mean), mean, deviation)
-        objective = torch.dot(unexpected, torch.from_numpy(weights).to(mean))
+        action = [u + s * z for u, s, z in zip(mu, sigma, noise, strict=True)]
+        scale = [-s * s for s in sigma] if self.variance_scaled else [-1.0] * m
+        taken, weights = x.new_tensor([action, scale])
+        mean, deviation, *value = outputs.split_with_sizes(self.parts)
+        unexpected = surprise(taken, mean, deviation)
         if self.learned:  # the gradient of V is the trace of TD(lambda); it moves no antecedents
-            state_value = consequents[-1] @ firing.detach()
-            self.value = state_value.item()
+            self.value = numbers[-1]
             # With fixed antecedents the last output has the same gradient, and a cheaper graph.
-            objective = objective + (state_value if self.antecedents else value[0])
-        net.accumulate(torch.autograd.grad(objective, parameters)[0], self.decay)
+            values = [consequents[-1:] @ firing.detach()] if self.antecedents else value
+            gradient = torch.autograd.grad((unexpected, *values), parameters, (weights, self.one))
+        else:
+            gradient = torch.autograd.grad(unexpected, parameters, weights)
+        net.accumulate(gradient[0], self.decay)
         if self.replays:
-            unlikely = sum(
-                math.log(s) + z * z / 2 for s, z in zip(sigma.tolist(), noise, strict=True)
-            )
-            self.decision = [*x.tolist(), *action.tolist(), unlikely]
-        self._log["mu"] += mu.tolist()
-        self._log["sigma"] += sigma.tolist()
+            unlikely = sum(math.log(s) + z * z / 2 for s, z in zip(sigma, noise, strict=True))
+            self.decision = [*x.tolist(), *action, unlikely]
+        self._log["mu"] += mu
+        self._log["sigma"] += sigma
         self._log["firing"].append(net.max_firing)
         return self._command(action)
 
@@ -255,27 +259,30 @@ class SGA:
         Another policy took them: each counts min(1, pi(a | x) now / then) (Wawrzynski, Neural
         Networks 22, 2009; Espeholt et al., ICML 2018).
         """
-        net = self.net
-        for _ in range(self.replays):
-            seen = self.memory.sample(self.rng, self.rates)
-            with torch.no_grad():
-                firing = net.normalised_firing(seen["state"])
-                ahead = net.normalised_firing(seen["following"]) @ net.consequents[:, -1]
+        net, firing_at = self.net, self.net.firing_function()
+        seen = self.memory.sample(self.replays, self.rng, self.rates)
+        here, there = net.features(seen.pop("state")), net.features(seen.pop("following"))
+        for x, following, *row in zip(here, there, *seen.values(), strict=True):
+            action, then, reward, goes_on = row
+            firing = firing_at(x)
+            ahead = firing_at(following) @ net.consequents[:, -1]
             consequents = net.learnable(antecedents=False)
-            mean, deviation, value = (firing @ consequents.T).split_with_sizes(self.parts, 1)
-            unexpected, value = surprise(seen["action"], mean, deviation), value[:, 0]
-            ratio = (seen["surprise"] - unexpected.detach().sum(1)).exp().clamp(max=1.0)
-            error = seen["reward"] + self.gamma * seen["goes_on"] * ahead - value.detach()
-            weights = deviation.detach().square() if self.variance_scaled else 1.0
-            objective = value - (weights * unexpected).sum(1)
-            (gradient,) = torch.autograd.grad(objective, consequents, ratio * error)
+            mean, deviation, value = (consequents @ firing.T).split_with_sizes(self.parts)
+            unexpected = surprise(action.T, mean, deviation)
+            ratio = (then - unexpected.detach().sum(0)).exp_().clamp_(max=1.0)
+            error = reward + self.gamma * goes_on * ahead - value.detach()
+            weights, spread = ratio * error, deviation.detach()
+            scale = spread.square() if self.variance_scaled else torch.ones_like(spread)
+            (gradient,) = torch.autograd.grad(
+                (value, unexpected), consequents, (weights, -weights * scale)
+            )
             net.adapt_batch(self.replay_rates, gradient, ratio @ firing)
             self._bound()
 
     def _tensor(self, observation: np.ndarray) -> Tensor:
         return torch.from_numpy(observation).to(self.rates)
 
-    def _command(self, action: np.ndarray) -> int | np.ndarray:
+    def _command(self, action: Sequence[float] | np.ndarray) -> int | np.ndarray:
         if self.actions != "three":
             return np.clip(action, -1, 1).astype(np.float32)
         return RIGHT if action[0] < -1 / 3 else LEFT if action[0] > 1 / 3 else STRAIGHT

@@ -17,7 +17,7 @@ has to join the blocks first.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Literal
 
 import torch
@@ -27,6 +27,7 @@ Growth = Literal["rule", "input", "literal", "frozen"]
 VIEWS = {"_active", "_centres", "_widths", "_consequents", "_traces", "_consequent_traces"}
 VIEWS |= {"_usage", "_learning"}
 BATCH = 32  # states from which on one product is faster than differences state by state
+PRECISION = 1e-4  # of the logarithm of a firing strength in such a product
 
 
 class SOFNN(nn.Module):
@@ -111,11 +112,14 @@ class SOFNN(nn.Module):
         if (periods < 0).any():
             raise ValueError("a period is positive, or 0 for an input that does not wrap")
         self.register_buffer("periods", periods, persistent=False)  # (n, 1)
+        frequencies = torch.where(periods > 0, 1 / periods, 0)
+        self.register_buffer("frequencies", frequencies, persistent=False)
         self.wrapping = [
             (i, (1 / period).item(), period.item())
             for i, period in enumerate(periods)
             if period > 0
         ]
+        self.lengths = (2 * n_inputs + 1, *[2] * len(self.wrapping))  # of the features
         self.parts = (n_inputs, n_inputs, n_outputs)  # rows of u, v and c in the table
         rows = sum(self.parts)
         self.register_buffer("traces_store", torch.zeros(rows, 0, dtype=dtype))
@@ -155,8 +159,23 @@ class SOFNN(nn.Module):
         """
         centres, widths = antecedents or self.table().split_with_sizes(self.parts)[:2]
         if x.dim() == 2 and len(x) >= BATCH:
-            return (-0.5 * self._distances(x, centres, widths)).softmax(-1)
+            product = self._multiplied_out(self.features(x), self._quadratic(centres, widths))
+            return product.to(x.dtype).softmax(-1)
         return (-0.5 * self._squares(x, centres, widths).sum(-2)).softmax(-1)
+
+    def firing_function(self) -> Callable[[Tensor], Tensor]:
+        """The normalised firing as a function of `features` (.., F), while the antecedents stay.
+
+        What depends on the antecedents alone is computed once, without a gradient.
+        """
+        quadratic = self._quadratic(self._centres, self._widths)
+
+        def firing(features: Tensor) -> Tensor:
+            flat = features.reshape(-1, features.shape[-1])
+            product = self._multiplied_out(flat, quadratic).to(features.dtype)
+            return product.softmax(-1).reshape(*features.shape[:-1], -1)
+
+        return firing
 
     def forward(self, x: Tensor) -> Tensor:
         """Weighted mean of the consequents (eqs 4, 10) for x of shape (B, n). Shape: (B, m)."""
@@ -178,24 +197,49 @@ class SOFNN(nn.Module):
             return (difference / widths).square()
         return difference.div_(widths).square_()  # new memory costs as much as the arithmetic
 
-    def _distances(self, x: Tensor, centres: Tensor, widths: Tensor) -> Tensor:
-        """Sum of the squares over the inputs for many states x (B, n) at once. Shape: (B, K).
+    def features(self, x: Tensor) -> Tensor:
+        """What log firing is a product of, at states x (.., n). Shape: (.., 2n+1 and 2 a period).
 
-        Multiplied out, x^2 / v^2 - 2 x u / v^2 + u^2 / v^2 is one product of matrices. In double
-        precision its cancellation, some 1e-16 (u / v)^2, stays far below single precision.
+        These are x^2, x and 1. Where an input wraps, a centre more than half a turn away is nearer
+        by 2 t (x - u - t / 2) / v^2 to x - t, one turn t further on: hence t^2 - 2 t x and t.
         """
-        wrapped = [i for i, _, _ in self.wrapping]
-        plain = [i for i in range(self.n_inputs) if i not in wrapped]
-        y, u = x[:, plain].double(), centres[plain].double()
-        precision = widths[plain].double().square().reciprocal()
+        y = x - self._turns(x)
+        parts = [y * y, y, torch.ones_like(y[..., :1])]
+        for i, _, period in self.wrapping:
+            angle = y[..., i : i + 1]
+            t = torch.copysign(angle.new_tensor(period), angle.detach())
+            parts += [t * (t - 2 * angle), -t]
+        return torch.cat(parts, -1)
+
+    def _quadratic(self, centres: Tensor, widths: Tensor) -> Tensor:
+        """Log firing of every rule as a polynomial in x: factors of x^2, x and 1. Shape: (2n+1, K).
+
+        What cancels in it is as large as (u / v)^2 / 2, so it is in double precision where single
+        would leave an error above `PRECISION`.
+        """
+        u = centres - self._turns(centres.T).T
+        if 0.5 * (u / widths).square().sum(0).max() * torch.finfo(u.dtype).eps > PRECISION:
+            u, widths = u.double(), widths.double()
+        precision = widths.square().reciprocal()
         weighted = precision * u
-        features, weights = torch.cat([y * y, y], 1), torch.cat([precision, -2 * weighted])
-        total = torch.addmm((weighted * u).sum(0), features, weights).to(x.dtype)
-        for i, frequency, period in self.wrapping:
-            angle = x[:, i, None] - centres[i]
-            angle = angle - (angle.detach() * frequency).round_() * period
-            total = total + (angle / widths[i]).square()
-        return total
+        constant = (weighted * u).sum(0, keepdim=True)
+        return torch.cat([-0.5 * precision, weighted, -0.5 * constant])
+
+    def _multiplied_out(self, features: Tensor, quadratic: Tensor) -> Tensor:
+        """Log firing of every rule from the features (B, F) of states. Shape: (B, K)."""
+        whole, *turned = features.to(quadratic).split_with_sizes(self.lengths, 1)
+        if not turned:
+            return whole @ quadratic
+        # Only where it is nearer one turn further on does a rule gain from the turn.
+        gained = [
+            (part @ quadratic[i :: self.n_inputs][:2]).relu_()
+            for part, (i, _, _) in zip(turned, self.wrapping, strict=True)
+        ]
+        return torch.addmm(sum(gained[1:], gained[0]), whole, quadratic)
+
+    def _turns(self, values: Tensor) -> Tensor:
+        """The whole turns in values (.., n), which have no gradient. Shape: (.., n)."""
+        return (values.detach() * self.frequencies.T).round_() * self.periods.T
 
     # ------------------------------------------------------------------------- structure, eq. 3
 

@@ -20,7 +20,7 @@ from sofnn_torch.guard import Divergence, Interrupted, SignalTrap, diagnose, phy
 from sofnn_torch.monitoring import Monitor, Trajectory, TrialRecord
 from sofnn_torch.policy import FrozenPolicy
 from sofnn_torch.runs import say
-from sofnn_torch.session import RunOptions, Session, environment_seed
+from sofnn_torch.session import RunOptions, Session, arithmetic, environment_seed
 
 __all__ = ["RunOptions", "environment_seed", "play", "replay", "resume", "train"]
 
@@ -107,7 +107,7 @@ def train(config: Config, options: RunOptions | None = None) -> Path:
         OSError: the disk refused the last checkpoint; the message says where it is instead.
     """
     options = options or RunOptions()
-    with SignalTrap() as trap:
+    with SignalTrap() as trap, arithmetic(options.threads):
         return _loop(session.begin(config, options), options, trap)
 
 
@@ -125,7 +125,7 @@ def resume(path: Path, options: RunOptions | None = None, trials: int | None = N
         ValueError, Interrupted, Divergence, OSError: as `train`.
     """
     options = options or RunOptions()
-    with SignalTrap() as trap:
+    with SignalTrap() as trap, arithmetic(options.threads):
         reopened = session.reopen(path, options, trials)
         if reopened.trial == reopened.run.config.trials:
             reopened.close()
@@ -134,6 +134,7 @@ def resume(path: Path, options: RunOptions | None = None, trials: int | None = N
         return _loop(reopened, options, trap)
 
 
+@arithmetic()
 def replay(path: Path) -> None:
     """Play the trial again that follows a saved state, e.g. that of a divergence.
 

@@ -46,16 +46,16 @@ def test_the_newest_decisions_stay():
         memory.add([i, i + 0.5, -i])
     assert len(memory) == 3
     assert sorted(memory.rows[:, 0]) == [2, 3, 4]
-    seen = memory.sample(np.random.default_rng(0), torch.zeros(1))
-    assert seen["state"].shape == (BATCH, 2) and seen["reward"].shape == (BATCH,)
-    torch.testing.assert_close(seen["state"][:, 1], 0.5 - seen["reward"])
+    seen = memory.sample(7, np.random.default_rng(0), torch.zeros(1))
+    assert seen["state"].shape == (7, BATCH, 2) and seen["reward"].shape == (7, BATCH)
+    torch.testing.assert_close(seen["state"][..., 1], 0.5 - seen["reward"])
 
 
 def test_every_decision_is_as_likely():
     memory, rng = ReplayMemory({"state": 1}, capacity=50), np.random.default_rng(0)
     for i in range(20):
         memory.add([i])
-    drawn = torch.cat([memory.sample(rng, torch.zeros(1))["state"] for _ in range(100)])
+    drawn = memory.sample(100, rng, torch.zeros(1))["state"]
     counts = drawn.flatten().int().bincount(minlength=20)
     assert len(counts) == 20 and stats.chisquare(counts.numpy()).pvalue > 0.001
 

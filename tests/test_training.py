@@ -5,6 +5,8 @@ import dataclasses
 import json
 import os
 import random
+import subprocess
+import sys
 import threading
 
 import numpy as np
@@ -16,7 +18,7 @@ from conftest import equal, quick_options, scalars, settings
 from sofnn_torch import checkpoint, training
 from sofnn_torch.config import make_env
 from sofnn_torch.runs import load_config
-from sofnn_torch.session import build
+from sofnn_torch.session import arithmetic, build
 from sofnn_torch.training import RunOptions, play
 
 
@@ -138,14 +140,24 @@ def test_the_generators_of_the_process_have_no_influence(tmp_path, same_run):
 
 
 @pytest.mark.parametrize("agent", ["sga", "q"])
-def test_the_number_of_threads_has_no_influence(agent, tmp_path, same_run):
-    config = settings(agent, "fixed", trials=2, net={"grid": (16, 16, 8)})  # 2048 rules
-    runs = [
-        training.train(config, quick_options(tmp_path / str(threads), threads=threads))
-        for threads in (1, 4)
-    ]
-    torch.set_num_threads(1)
-    same_run(*runs)
+def test_the_number_of_threads_has_no_influence_without_replay(agent, tmp_path, same_run):
+    command = [sys.executable, "-m", "sofnn_torch.cli", "--agent", agent, "--network", "fixed"]
+    command += "--net.grid 16 16 8 --maze.max-steps 120 --trials 2 --quiet".split()  # 2048 rules
+    command += [f"--{agent}.replays", "0"]
+    for threads in ("1", "4"):
+        place = ["--runs", str(tmp_path), "--name", threads, "--threads", threads]
+        subprocess.run(command + place, check=True)
+    same_run(tmp_path / "1", tmp_path / "4")
+
+
+def test_tiny_numbers_count_as_zero_in_training_only():
+    def tiny() -> float:
+        return (torch.tensor(1e-30) * 1e-10).item()
+
+    assert tiny() > 0
+    with arithmetic(), arithmetic():
+        assert tiny() == 0
+    assert tiny() > 0
 
 
 def test_a_resume_with_other_threads_says_so(options, capsys):

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import torch
 from joblib import Parallel, delayed
 from tqdm import tqdm
 
@@ -23,6 +22,7 @@ from sofnn_torch.monitoring import Trajectory, TrialRecord
 from sofnn_torch.reproduce.robustness import under_conditions
 from sofnn_torch.reproduce.studies import STUDIES, essence, settings
 from sofnn_torch.runs import say
+from sofnn_torch.session import arithmetic
 
 EPISODES = 10  # evaluation trials of a run, for each policy
 WORK = "import sys; from sofnn_torch.reproduce.running import work; sys.exit(work(*sys.argv[1:]))"
@@ -127,9 +127,9 @@ def _command(job: Job) -> list[str]:
 # ------------------------------------------------------------------------------- a single run
 
 
+@arithmetic()
 def work(directory: str, text: str, conditions: str = "") -> int:
     """Train, evaluate and play in other conditions what is not done yet; the exit code."""
-    torch.set_num_threads(1)
     path, config = Path(directory), from_dict(json.loads(text))
     wall, cpu, code = time.perf_counter(), time.process_time(), 0
     try:
