@@ -330,7 +330,7 @@ def fake(out, name, trials=30, seeds=8):
         for arm, entries in STUDIES[name].arms.items()
     }
     summary = {"study": name, "title": STUDIES[name].title, "about": STUDIES[name].about}
-    summary |= {"command": "the command", "quick": False, "optimum": OPTIMUM, "episodes": 10}
+    summary |= {"made_with": ["the command"], "quick": False, "optimum": OPTIMUM, "episodes": 10}
     summary |= {"in_a_row": 10, "within": 1.5, "runs": 3, "wall_seconds": 1, "cpu_seconds": 1}
     summary |= {"commits": ["abc"], "versions": [{"torch": "2"}], "arms": arms}
     (out / f"{name}.json").write_text(json.dumps(summary))
@@ -422,7 +422,12 @@ def test_data_of_runs_become_a_page(tmp_path, monkeypatch):
     assert data.column("sga-rule", "total_steps").tolist() == [60, 60]
     assert [curve.tolist() for curve in data.curves("sga-rule", "steps")] == [[30, 30]] * 2
     assert data.info["arms"]["sga-rule"]["config"]["maze"]["max_steps"] == 30
-    assert data.info["command"].endswith("--study growth --seeds 0-1 --trials 2 --max-steps 30")
+    (made,) = data.info["made_with"]
+    assert made.endswith("--study growth --arms sga-rule --seeds 0-1 --trials 2 --max-steps 30")
+    assert command.run(command.Options(**options | {"seeds": "0"})) == 0  # has nothing left to do
+    assert command.run(command.Options(**options)) == 0
+    both = results.read(out, "growth").info["made_with"]
+    assert both == [made, made.replace("0-1", "0")]
     assert "| sga-rule |" in (out / "growth.md").read_text()
     assert "growth.md" in (out / "README.md").read_text()
 

@@ -83,7 +83,7 @@ def command(name: str, options: Options) -> str:
     words = [f"python -m sofnn_torch.reproduce --study {name}", *["--quick"] * options.quick]
     words += [
         f"--{flag.replace('_', '-')} {getattr(options, flag)}"
-        for flag in ("seeds", "trials", "max_steps")
+        for flag in ("arms", "seeds", "trials", "max_steps")
         if getattr(options, flag) != getattr(usual, flag)
     ]
     return " ".join(words)

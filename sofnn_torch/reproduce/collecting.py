@@ -30,7 +30,8 @@ def collect(
         parent: where the runs are.
         out: where the data goes.
         changes: settings that are changed in every arm.
-        notes: more entries of the summary: command, quick and optimum.
+        notes: more entries of the summary: command, quick and optimum. Commands of earlier
+            sittings stay beside this one.
 
     The files are <study>.csv (a line for each run), <study>-curves.csv (steps and rules of each
     trial), <study>-paths.csv (the last trial), <study>-conditions.csv and <study>.json.
@@ -70,11 +71,15 @@ def collect(
         if rows:
             write_table(out / f"{name}{'-' * bool(part)}{part}.csv", rows)
     seconds = {path: (wall, cpu) for path, wall, cpu in spans}  # arms may share runs
+    notes, file = dict(notes), out / f"{name}.json"
+    earlier = json.loads(file.read_text()).get("made_with", []) if file.exists() else []
+    made_with = [*earlier, notes.pop("command")]
     summary = {
         "study": name,
         "title": study.title,
         "about": study.about,
         **notes,
+        "made_with": list(dict.fromkeys(made_with)),
         "episodes": EPISODES,
         "in_a_row": IN_A_ROW,
         "within": WITHIN,
@@ -85,7 +90,7 @@ def collect(
         "versions": _distinct(source["versions"] for source in sources),
         "arms": arms,
     }
-    (out / f"{name}.json").write_text(json.dumps(summary, indent=1) + "\n")
+    file.write_text(json.dumps(summary, indent=1) + "\n")
 
 
 def _row(path: Path, config: Config, optimum: int) -> dict[str, Any]:

@@ -96,12 +96,16 @@ def provenance(info: dict[str, Any]) -> str:
     )
     hours = info["wall_seconds"] / 3600, info["cpu_seconds"] / 3600
     return (
-        f"Made with `{info['command']}`; number of runs: {info['runs']}, together {hours[0]:.2f} "
+        f"Made with {_commands(info)}; number of runs: {info['runs']}, together {hours[0]:.2f} "
         f"hours of wall time and {hours[1]:.2f} of processor time. Commit: {commits}. "
         f"Versions: {versions}. Settings and seeds of every arm: "
         f"[{info['study']}.json]({info['study']}.json); a line for each run: "
         f"[{info['study']}.csv]({info['study']}.csv)."
     )
+
+
+def _commands(info: dict[str, Any]) -> str:
+    return ", ".join(f"`{command}`" for command in info["made_with"])
 
 
 def page(out: Path, data: Data) -> str:
@@ -173,7 +177,7 @@ def write(out: Path) -> int:
         seeds = sorted({len(arm["seeds"]) for arm in data.info["arms"].values()})
         count = "-".join(map(str, seeds[:: max(1, len(seeds) - 1)]))
         link = f"[{data.info['title']}]({name}.md)"
-        index.append([link, str(len(data.info["arms"])), count, f"`{data.info['command']}`"])
+        index.append([link, str(len(data.info["arms"])), count, _commands(data.info)])
     text = (
         "# Results\n\nEvery table and figure here is written by a command, from the data beside "
         "it. `python -m sofnn_torch.reproduce --report-only` writes them anew without running "

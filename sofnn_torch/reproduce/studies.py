@@ -120,6 +120,8 @@ HELPS: dict[str, dict[str, Arm]] = {
 NETWORK: dict[str, Arm] = {
     "literal-dead-reckoning": {"maze.dead_reckoning": "literal"},
     "still-dead-reckoning": {"maze.dead_reckoning": "still"},
+    "growth-input": {"net.growth": "input"},
+    "growth-literal": {"net.growth": "literal"},
     "theta-times-0.5": {"net.theta": Times(0.5)},
     "theta-times-1.5": {"net.theta": Times(1.5)},
     "width-times-0.7": {"net.width_position": Times(0.7), "net.width_heading": Times(0.7)},
