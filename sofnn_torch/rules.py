@@ -145,7 +145,7 @@ def decision_table(reading: Reading, decision: Decision) -> Table:
             cell = number(decision.conclusions[rule, j])
             if by_action:  # a rule fires for few of the actions
                 weight = shares[rule, j]
-                cell = f"{weight:.0%} × {cell}" if weight >= 0.005 else ""  # noqa: RUF001
+                cell = f"{weight:.0%}×{cell}" if weight >= 0.005 else ""  # noqa: RUF001
             cells.append(cell)
         view.add_row(str(rule + 1), f"{share[rule]:.1%}", *cells)
     rest, blank = order[count:], [""] * len(reading.antecedents)
