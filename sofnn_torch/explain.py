@@ -27,13 +27,13 @@ class Reading:
     Attributes:
         antecedents: by the name of the input with its unit, as in ``x, mm``.
         consequents: by the name of what is concluded; the chosen action has no name.
-        outvoted: rules, marked with a star, at whose centre all rules together choose another
-            action than the rule itself.
+        outvoted: whether all rules together choose another action at the centre of a rule than the
+            rule itself; False where actions are continuous or antecedents. Shape: (K,).
     """
 
     antecedents: dict[str, list[str]]
     consequents: dict[str, list[str]]
-    outvoted: int
+    outvoted: NDArray[np.bool_]
 
     def brief(self) -> list[str]:
         """The main conclusion of each rule in a few words, for a legend."""
@@ -41,7 +41,7 @@ class Reading:
         if more and more[0][0] == "mu right":
             pairs = zip(cells, more[0][1], strict=True)
             return [f"wheels {left}, {right}" for left, right in pairs]
-        return [f"{name} {cell.removesuffix(' *')}".strip() for cell in cells]
+        return [f"{name} {cell}".strip() for cell in cells]
 
     def sentences(self) -> list[str]:
         """Each rule as one line of text."""
@@ -88,32 +88,36 @@ class Decision:
 @torch.no_grad()
 def read(agent: Agent) -> Reading:
     """All rules of a learner in words."""
-    net, columns = agent.net, {}
-    centres, widths = net.centres.T.tolist(), net.widths.T.tolist()
-    for name, factor in (("x, mm", 1000), ("y, mm", 1000)):
-        pairs = zip(centres[len(columns)], widths[len(columns)], strict=True)
-        columns[name] = [f"{factor * u:.0f} ± {factor * v:.0f}" for u, v in pairs]
-    pairs = zip(centres[2], widths[2], strict=True)
-    columns["heading"] = [f"{bearing(u, math.degrees(v))}" for u, v in pairs]
-    if net.n_inputs > 3:
-        pairs = zip(centres[3], widths[3], strict=True)
+    net = agent.net
+    x, y, heading, *action = (
+        list(zip(u, v, strict=True))
+        for u, v in zip(net.centres.T.tolist(), net.widths.T.tolist(), strict=True)
+    )
+    columns = {
+        "x, mm": [f"{1000 * u:.0f} ± {1000 * v:.0f}" for u, v in x],
+        "y, mm": [f"{1000 * u:.0f} ± {1000 * v:.0f}" for u, v in y],
+        "heading": [bearing(u, v) for u, v in heading],
+    }
+    for pairs in action:
         columns["action"] = [f"{number(u)} ± {v:.2f}" for u, v in pairs]
     return Reading(columns, *_consequents(agent))
 
 
-def _consequents(agent: Agent) -> tuple[dict[str, list[str]], int]:
-    """The consequents of a `Reading`, and how many rules are outvoted."""
+def _consequents(agent: Agent) -> tuple[dict[str, list[str]], NDArray[np.bool_]]:
+    """The consequents of a `Reading`, and which rules are outvoted."""
     states = agent.net.centres[:, :3]
     names, table = conclusions(agent, states)
     numbers = {name: list(map(number, table[:, i].tolist())) for i, name in enumerate(names)}
+    nobody = np.zeros(len(states), bool)
     if not (actions := _actions(agent)):
-        return numbers, 0
+        return numbers, nobody
     turns, scale = survey(agent, states.numpy()).turn, _scale(agent)
     together = np.abs(turns[:, None] - scale).argmin(1)
     if agent.net.n_inputs > 3:  # each rule is about one action
         features = torch.cat([agent.net.centres, states.new_ones(len(states), 1)], 1)
         values = (agent.net.consequents * features).sum(1).tolist()
-        return {"Q": list(map(number, values)), "best there": [actions[j] for j in together]}, 0
+        words = [actions[j] for j in together.tolist()]
+        return {"Q": list(map(number, values)), "best there": words}, nobody
     if isinstance(agent, SGA):
         alone = 1 + (table[:, 0] > 1 / 3).astype(int) - (table[:, 0] < -1 / 3)
     else:
@@ -121,10 +125,10 @@ def _consequents(agent: Agent) -> tuple[dict[str, list[str]], int]:
         alone[(table == table.max(1, keepdims=True)).sum(1) > 1] = -1
     outvoted = (alone >= 0) & (alone != together)
     said = [*actions, "undecided"]  # the last for -1
-    words = [said[j] + " *" * int(star) for j, star in zip(alone, outvoted, strict=True)]
+    words = [said[j] for j in alone.tolist()]
     if len(names) > MANY:
         numbers = {"Q": list(map(number, table.max(1).tolist()))}
-    return {"": words} | numbers, int(outvoted.sum())
+    return {"": words} | numbers, outvoted
 
 
 def conclusions(agent: Agent, x: torch.Tensor) -> tuple[list[str], NDArray[np.float64]]:
@@ -180,9 +184,9 @@ def _scale(agent: Agent) -> list[float]:
 
 
 def bearing(heading: float, width: float | None = None) -> str:
-    """A heading in radians as degrees and a direction, if need be with a width in degrees."""
+    """A heading in radians as degrees and a direction, with a width in radians if there is one."""
     degrees = round(math.degrees(math.remainder(heading, 2 * math.pi)))
-    spread = "" if width is None else f" ± {width:.0f}"
+    spread = "" if width is None else f" ± {math.degrees(width):.0f}"
     return f"{degrees}{spread}° {WINDS[round(degrees / 45) % 8]}"
 
 

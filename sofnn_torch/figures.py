@@ -235,6 +235,8 @@ def rules(
     cells = figure.add_gridspec(inputs, 2, width_ratios=[1.2, 1])
     ax = figure.add_subplot(cells[:, 0])
     rule_map(plan, agent, ax, weights)
+    ax.get_legend().set_title("all rules together, at each centre", {"size": 8})
+    ax.get_legend().set_alignment("left")
     best = np.argsort(-weights, kind="stable")[: len(SERIES)].tolist()
     names = {rule: f"rule {rule + 1}: {texts[rule]}" for rule in best}
     for rule in best:
@@ -250,7 +252,9 @@ def rules(
         if i == 0:
             place = {"loc": "lower left", "bbox_to_anchor": (-0.04, 1), "alignment": "left"}
             spaces = {"ncols": 2, "handlelength": 2, "columnspacing": 1, "handletextpad": 0.5}
-            ax.legend(title="rules that fire most", title_fontsize=8, **place, **spaces)
+            ax.legend(
+                title="rules that fire most, each by itself", title_fontsize=8, **place, **spaces
+            )
     return figure
 
 

@@ -112,8 +112,8 @@ def summary(shares: NDArray[Any], decisions: int, reading: Reading) -> str:
     idle = int((shares * decisions < FIRED).sum())
     text = f"{len(shares):,} rules: {half:,} make up 50 % of the firing along the trial, "
     text += f"{most:,} make up 90 %, {idle:,} took no part"
-    if reading.outvoted:
-        text += f"\n{reading.outvoted:,} rules (*) are outvoted: where they are centred, all rules "
+    if outvoted := int(reading.outvoted.sum()):
+        text += f"\n{outvoted:,} rules (*) are outvoted: where they are centred, all rules "
         text += "together choose another action"
     return text
 
@@ -124,6 +124,7 @@ def table(reading: Reading, shares: NDArray[Any], top: int) -> Table:
     view = _headed(reading, reading.consequents)
     for rule in np.argsort(-shares, kind="stable")[: top or None].tolist():
         cells = [column[rule] for column in columns.values()]
+        cells[len(reading.antecedents)] += " *" * int(reading.outvoted[rule])
         view.add_row(str(rule + 1), f"{shares[rule]:.1%}", *cells)
     return view
 
@@ -214,7 +215,8 @@ def write(options: Options, config: Config, agent: Agent, reading: Reading, shar
     """
     kind = rulefiles.schema(agent)
     parameters = agent.net.table().detach().T.numpy()
-    comments = {"usage": shares.tolist(), "text": reading.sentences()}
+    comments = {"usage": shares.tolist(), "outvoted": reading.outvoted.tolist()}
+    comments["text"] = reading.sentences()
     if options.json:
         data = rulefiles.to_json(kind, parameters, comments)
         checkpoint.write_atomically(options.json, data)

@@ -292,7 +292,9 @@ def test_a_rule_that_all_rules_together_overrule_is_marked():
         (1.0, 0.1, 0.0), (-0.5, 0.1, 0.0), (0.1, 0.1, 0.0), at=[here, here, (0, 0, 0.0)]
     )
     said = explain.read(learner)
-    assert said.consequents[""] == ["left turn *", "right turn *", "straight"]
+    assert said.consequents[""] == ["left turn", "right turn", "straight"]
+    assert said.outvoted.tolist() == [True, True, False]
+    assert printed(rules.table(said, np.ones(3), 0)).count("turn * ") == 2
     text = rules.summary(np.array([0.5, 0.45, 0.05]), 10, said)
     assert "3 rules: 1 make up 50 % of the firing along the trial, 2 make up 90 %, 0 took" in text
     assert "2 rules (*) are outvoted" in text
