@@ -67,8 +67,13 @@ def canvas(
 
 def png(figure: Figure, dpi: int = 120) -> bytes:
     """The figure as a PNG file."""
+    return saved(figure, "png", dpi)
+
+
+def saved(figure: Figure, kind: str, dpi: int = 200) -> bytes:
+    """The figure as a file: png, svg or pdf."""
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=dpi)
+    figure.savefig(buffer, format=kind, dpi=dpi)
     return buffer.getvalue()
 
 
@@ -175,6 +180,82 @@ def rule_map(
     _headings(ax, centres, 0.02, colors=colours, linewidths=0.7, zorder=4)
     ax.scatter(*centres[:, :2].T, s=sizes, c=colours, alpha=0.75, linewidths=0, zorder=4)
     _turn_legend(ax, "o")
+
+
+@styled
+def memberships(
+    plan: "MazePlan", agent: "Agent", i: int, ax: Axes, names: Mapping[int, str]
+) -> None:
+    """Membership functions (eq. 1) of some rules on input i: x, y, heading or action.
+
+    Args:
+        plan: the maze, for the range of positions.
+        agent: the learner.
+        i: number of the input.
+        ax: where to draw.
+        names: the rules and how the legend names them.
+
+    Raises:
+        ValueError: there are more rules than line styles.
+    """
+    if len(names) > len(SERIES):
+        raise ValueError(f"at most {len(SERIES)} rules can be told apart, got {len(names)}")
+    x0, y0, x1, y1 = bounds(plan)
+    low, high = ((x0, x1), (y0, y1), (-math.pi, math.pi), (-1.0, 1.0))[i]
+    x, period = np.linspace(low, high, 400), agent.net.periods[i].item()
+    scale = 180 / math.pi if period else 1.0
+    for (rule, name), (colour, line) in zip(names.items(), SERIES, strict=False):
+        distance = x - agent.net.centres[rule, i].item()
+        if period:
+            distance -= period * np.round(distance / period)
+        curve = np.exp(-0.5 * (distance / agent.net.widths[rule, i].item()) ** 2)
+        ax.plot(scale * x, curve, color=colour, linestyle=line, linewidth=1.4, label=name)
+    label = ("x [m]", "y [m]", "heading [degrees]", "action: right turn (-1) to left turn (1)")[i]
+    ax.set(xlabel=label, xlim=(scale * low, scale * high), ylim=(0, 1.05), yticks=(0, 1))
+    ax.xaxis.set_major_locator(MultipleLocator(90 if period else 0.2 if i < 2 else 0.5))
+
+
+@styled
+def rules(
+    plan: "MazePlan",
+    agent: "Agent",
+    weights: NDArray[Any],
+    texts: Sequence[str],
+) -> Figure:
+    """All rules on the maze, and the membership functions of those with the largest weights.
+
+    Args:
+        plan: the maze.
+        agent: the learner.
+        weights: a use of each rule (`usage`). Shape: (K,).
+        texts: what each rule concludes, in words. K of them.
+    """
+    figure = Figure(figsize=(7.2, 3.9), layout="compressed")
+    inputs = agent.net.n_inputs
+    cells = figure.add_gridspec(inputs, 2, width_ratios=[1.2, 1])
+    ax = figure.add_subplot(cells[:, 0])
+    rule_map(plan, agent, ax, weights)
+    ax.get_legend().set_title("all rules together, at each centre", {"size": 8})
+    ax.get_legend().set_alignment("left")
+    best = np.argsort(-weights, kind="stable")[: len(SERIES)].tolist()
+    names = {rule: f"rule {rule + 1}: {texts[rule]}" for rule in best}
+    for rule in best:
+        at = agent.net.centres[rule, :2].tolist()
+        ax.add_patch(Circle(at, 0.02, fill=False, edgecolor=PURPLE, linewidth=1.4, zorder=7))
+        halo = [withStroke(linewidth=2, foreground="white")]
+        _note(ax, str(rule + 1), at, 7, ha="center", path_effects=halo, zorder=7)
+    for i in range(inputs):
+        ax = figure.add_subplot(cells[i, 1])
+        memberships(plan, agent, i, ax, names)
+        if i == inputs // 2:
+            ax.set_ylabel("membership")
+        if i == 0:
+            place = {"loc": "lower left", "bbox_to_anchor": (-0.04, 1), "alignment": "left"}
+            spaces = {"ncols": 2, "handlelength": 2, "columnspacing": 1, "handletextpad": 0.5}
+            ax.legend(
+                title="rules that fire most, each by itself", title_fontsize=8, **place, **spaces
+            )
+    return figure
 
 
 def _grid(plan: "MazePlan", columns: int, headings: int) -> tuple[NDArray[Any], NDArray[Any]]:

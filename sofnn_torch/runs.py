@@ -16,6 +16,7 @@ import os
 import shutil
 import sys
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -53,8 +54,17 @@ class Run:
         self._anchor: int | None = None
 
     @classmethod
-    def create(cls, parent: Path, name: str | None, config: Config, keep: int) -> "Run":
+    def create(
+        cls, parent: Path, name: str | None, config: Config, keep: int, earlier: Sequence[Any] = ()
+    ) -> "Run":
         """Make a new directory and write the settings into it.
+
+        Args:
+            parent: directory of all runs.
+            name: of the new directory; made from the settings if None.
+            config: the settings.
+            keep: checkpoints that are kept.
+            earlier: versions and commits of the sessions that it comes from.
 
         Raises:
             ValueError: the name is taken or the directory cannot be written.
@@ -65,6 +75,7 @@ class Run:
             raise ValueError(f"{path} exists: choose another --name, or go on with --resume {path}")
         # Filled under another name first, so that a run directory always has its settings.
         run = cls(parent / f".{path.name}-{os.getpid()}.tmp", config, keep)
+        run.earlier = list(earlier)
         try:
             run.path.mkdir(parents=True)
             run._write_settings()

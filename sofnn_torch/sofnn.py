@@ -365,6 +365,53 @@ class SOFNN(nn.Module):
         self._activate(kept)
         return dropped
 
+    @torch.no_grad()
+    def replace_rules(self, centres: Tensor, widths: Tensor, consequents: Tensor) -> None:
+        """Put these rules, for example edited ones, in the place of all; traces and usage are zero.
+
+        With the growth criterion ``input`` a membership function that was there before keeps its
+        label, and rules whose centre and width on an input are equal share one.
+
+        Args:
+            centres: Shape: (K, n).
+            widths: Shape: (K, n).
+            consequents: Shape: (K, m).
+
+        Raises:
+            ValueError: a shape or number that no rule may have, no rule, more than ``max_rules``,
+                or another number of rules than a frozen structure has. Nothing is changed then.
+        """
+        count, n = len(centres), self.n_inputs
+        parts = [part.to(self._whole) for part in (centres, widths, consequents)]
+        shapes = [tuple(part.shape) for part in parts]
+        if shapes != [(count, rows) for rows in self.parts] or not 1 <= count <= self.max_rules:
+            raise ValueError(
+                f"need 1 to {self.max_rules} rules with {n} centres, {n} widths and "
+                f"{self.n_outputs} consequents each, got the shapes {shapes}"
+            )
+        if self.growth == "frozen" and self.n_rules not in (0, count):
+            raise ValueError(f"a frozen structure keeps its {self.n_rules} rules, got {count}")
+        table = torch.cat(parts, 1).T
+        if not (table.isfinite().all() and (table[n : 2 * n] >= self.min_width).all()):
+            raise ValueError(f"rules need finite numbers and widths of {self.min_width} or more")
+        labels = self._labels_for(table) if self.growth == "input" else 0
+        self._allocate([max(count, self.block_size)])
+        self._whole[:, :count] = table
+        self.labels_store[:, :count] = labels
+        self._activate(count)
+
+    def _labels_for(self, table: Tensor) -> Tensor:
+        """Which membership function each rule of another table (2n+m, K') uses. Shape: (n, K')."""
+        n, k, labels = self.n_inputs, self.n_rules, []
+        for i in range(n):
+            both = torch.cat([self._whole[:, :k], table], 1)[[i, n + i]]
+            functions, index = both.unique(dim=1, return_inverse=True)
+            first = int(self.labels[i].max()) + 1 if k else 0
+            label = torch.arange(first, first + functions.shape[1], device=table.device)
+            label[index[:k]] = self.labels[i]
+            labels.append(label[index[k:]])
+        return torch.stack(labels)
+
     @property
     def capacity(self) -> int:
         """Rules that fit before the next block is appended."""
