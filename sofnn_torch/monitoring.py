@@ -79,6 +79,10 @@ class Trajectory:
     true: NDArray[np.float64]
     estimated: NDArray[np.float64]
 
+    def decided_at(self, pose: str) -> NDArray[np.float64]:
+        """The states (T - 1, 3) of the decisions, for a robot that knows its pose by this mode."""
+        return (self.true if pose == "true" else self.estimated)[:-1]
+
 
 class Monitor:
     """Writes a run's progress for TensorBoard into its directory.
@@ -200,10 +204,10 @@ class Monitor:
             env = make_env(self.config)
             self._plan = env.unwrapped.plan
             env.close()
-        plan = self._plan
+        plan, states = self._plan, path.decided_at(self.config.pose)
         drawings = {
             "trajectory": lambda ax: figures.trajectory(plan, path, ax),
-            "rules": lambda ax: figures.rule_map(plan, agent, ax, usage(agent, path.estimated)),
+            "rules": lambda ax: figures.rule_map(plan, agent, ax, usage(agent, states)),
             "policy": lambda ax: figures.action_field(plan, agent, ax),
             "pose_error": lambda ax: figures.pose_error(path, ax, plan),
         }

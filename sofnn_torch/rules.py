@@ -31,7 +31,7 @@ from sofnn_torch.evaluate import load
 from sofnn_torch.explain import Decision, Reading, number
 from sofnn_torch.flags import parse
 from sofnn_torch.runs import Run, first_free
-from sofnn_torch.session import RunOptions
+from sofnn_torch.session import RunOptions, arithmetic
 from sofnn_torch.survey import usage
 from sofnn_torch.training import play
 
@@ -100,9 +100,8 @@ def firing_along_a_trial(config: Config, agent: Agent, seed: int) -> tuple[NDArr
         record, path = play(env, agent, learn=False, explore=False)
     finally:
         env.close()
-    states = path.true if config.pose == "true" else path.estimated
     outcome = f"{'goal' if record.success else 'no goal'} after {record.steps:,} steps"
-    return usage(agent, states[:-1]), record.decisions, outcome
+    return usage(agent, path.decided_at(config.pose)), record.decisions, outcome
 
 
 def summary(shares: NDArray[Any], decisions: int, reading: Reading) -> str:
@@ -230,6 +229,7 @@ def write(options: Options, config: Config, agent: Agent, reading: Reading, shar
         checkpoint.write_atomically(options.picture, data)
 
 
+@arithmetic()
 def run(options: Options) -> None:
     """What the command does.
 
@@ -238,7 +238,6 @@ def run(options: Options) -> None:
         OSError: a file cannot be written.
     """
     check(options)
-    torch.set_num_threads(1)
     config, agent, path, state = load(options.run)
     if options.load:
         new, rules = edit(options, config, agent, path, state), agent.net.n_rules

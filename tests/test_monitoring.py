@@ -16,7 +16,7 @@ from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
 from sofnn_torch import monitoring
 from sofnn_torch.config import make_agent, make_env, preset
 from sofnn_torch.events import EventFile
-from sofnn_torch.monitoring import Monitor, film, gif
+from sofnn_torch.monitoring import Monitor, Trajectory, film, gif
 from sofnn_torch.rendering import RenderingError
 from sofnn_torch.training import play
 
@@ -249,3 +249,11 @@ def test_a_gif_has_all_frames():
     frames = [np.full((24, 32, 3), 40 * i, np.uint8) for i in range(5)]
     picture = Image.open(io.BytesIO(gif(iter(frames))))
     assert (picture.format, picture.size, picture.n_frames) == ("GIF", (32, 24), 5)
+
+
+def test_the_states_of_the_decisions_are_those_that_the_robot_knew():
+    true, estimated = np.arange(9.0).reshape(3, 3), -np.arange(9.0).reshape(3, 3)
+    path = Trajectory(true, estimated)
+    np.testing.assert_array_equal(path.decided_at("true"), true[:2])
+    for pose in ("estimated", "odometry"):
+        np.testing.assert_array_equal(path.decided_at(pose), estimated[:2])
