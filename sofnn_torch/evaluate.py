@@ -11,7 +11,6 @@ samples its learned stochastic policy. Nothing is learned and the run directory 
 import dataclasses
 import json
 import math
-import sys
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -27,7 +26,7 @@ from scipy import stats
 
 from sofnn_torch import checkpoint
 from sofnn_torch.config import Agent, Config, make_agent, make_env
-from sofnn_torch.flags import parse
+from sofnn_torch.flags import command
 from sofnn_torch.monitoring import TrialRecord, film, gif
 from sofnn_torch.optimum import optimal_steps
 from sofnn_torch.runs import load_config, same_settings, say, versions
@@ -274,11 +273,7 @@ def run(options: Options) -> dict[str, Estimate]:
 
 def main() -> None:
     """Entry point of ``python -m sofnn_torch.evaluate``."""
-    try:
-        run(parse(Options, sys.argv[1:], __doc__))
-    except (ValueError, OSError, RuntimeError, ArithmeticError) as error:
-        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
-        sys.exit(2)
+    command(run, Options, __doc__)
 
 
 if __name__ == "__main__":

@@ -3,7 +3,8 @@
 import contextlib
 import io
 import re
-from collections.abc import Sequence
+import sys
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import tyro
@@ -31,6 +32,24 @@ def parse(kind: Any, argv: Sequence[str], description: str, default: Any = None)
         if not stop.code:
             raise
     raise ValueError(f"{_first_message(messages.getvalue())} (--help lists all flags)")
+
+
+def command(action: Callable[[Any], Any], kind: Any, description: str) -> None:
+    """Do an action with the settings that the command line gives; what is wrong is one line.
+
+    Args:
+        action: takes settings of the class.
+        kind: the class, as for `parse`.
+        description: shown above the flags in the help.
+
+    Raises:
+        SystemExit: with code 2 after an error that a user can do something about.
+    """
+    try:
+        action(parse(kind, sys.argv[1:], description))
+    except (ValueError, OSError, RuntimeError, ArithmeticError) as error:
+        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
+        sys.exit(2)
 
 
 def _first_message(framed: str) -> str:

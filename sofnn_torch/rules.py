@@ -11,7 +11,6 @@ The run directory is not changed. docs/rules.md says how to read a rule and what
 import json
 import math
 import shutil
-import sys
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,7 +28,7 @@ from sofnn_torch import checkpoint, explain, figures, rulefiles
 from sofnn_torch.config import Agent, Config, make_env
 from sofnn_torch.evaluate import load
 from sofnn_torch.explain import Decision, Reading, number
-from sofnn_torch.flags import parse
+from sofnn_torch.flags import command
 from sofnn_torch.runs import Run, first_free
 from sofnn_torch.session import RunOptions, arithmetic
 from sofnn_torch.survey import usage
@@ -263,11 +262,7 @@ def run(options: Options) -> None:
 
 def main() -> None:
     """Entry point of ``python -m sofnn_torch.rules``."""
-    try:
-        run(parse(Options, sys.argv[1:], __doc__))
-    except (ValueError, OSError, RuntimeError, ArithmeticError) as error:
-        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
-        sys.exit(2)
+    command(run, Options, __doc__)
 
 
 if __name__ == "__main__":
