@@ -88,6 +88,7 @@ def main() -> None:
     report(samples, log, soak)
 
 
+@figures.styled
 def report(samples: list[dict[str, float]], log: float, soak: Soak) -> None:
     """Print a table and write the samples and their plot."""
     columns = {name: np.array([sample[name] for sample in samples]) for name in samples[0]}

@@ -1,15 +1,20 @@
-"""The benchmark of training runs to its end: what it compares is the same work."""
+"""The benchmarks run to their end and compare what they say they compare."""
 
 import json
+import math
 import sys
 from pathlib import Path
 
 import pytest
+import torch
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 
 import learning
+import neighbours
 import training
+
+from sofnn_torch.sofnn import SOFNN
 
 
 def test_training_is_measured_for_both_learners_and_both_physics(tmp_path, monkeypatch, capsys):
@@ -40,3 +45,17 @@ def test_the_measured_learner_keeps_its_number_of_rules(name):
         decide()
     assert agent.net.n_rules == 50
     assert agent.net.refused > 0
+
+
+def test_the_near_rules_miss_no_more_than_the_bound():
+    widths, reach = [0.06, 0.06, 0.45], 4.0
+    net = SOFNN(3, 3, width=widths, periods=(0, 0, 2 * math.pi), theta=0.4)
+    xs = torch.from_numpy(learning.states(3_000, seed=3))
+    for x in xs:
+        net.grow(x)
+    cells = neighbours.Cells(net, reach * widths[0])
+    missed = neighbours.error(net, cells, xs[:200])
+    assert 0 < missed < net.n_rules * math.exp(-0.5 * reach**2) / net.theta
+    near = [len(cells.near(x)[0]) for x in xs[:200]]
+    assert max(near) < net.n_rules
+    torch.testing.assert_close(cells.conclude(xs[0]), net(xs[:1])[0], rtol=0.01, atol=0.01)

@@ -92,8 +92,8 @@ def _of_the_paper(data: Data) -> Iterator[tuple[str, Figure | None, str]]:
         figure, axes = figures.canvas(2, width=3.8, height=3.3)
         for ax, (agent, arms) in zip(axes, panels.items(), strict=True):
             figures.learning_curves(arms, ax, reference=optimum)
-            ax.set_title(f"{AGENTS[agent]}, SOFNN")
-            ax.legend(loc="upper right")
+            _legend_above(ax)
+            ax.set_title(f"{AGENTS[agent]}, SOFNN", y=1.1)
         axes[1].sharey(axes[0])
         yield (
             "fig10",
