@@ -1,6 +1,7 @@
 """What the benchmarks share: interleaved timing, the machine, JSON."""
 
 import argparse
+import contextlib
 import gc
 import json
 import os
@@ -15,6 +16,8 @@ import numpy as np
 import torch
 
 from sofnn_torch.session import arithmetic
+
+UNTIL_THE_END = contextlib.ExitStack()
 
 
 def interleaved(
@@ -67,7 +70,7 @@ def arguments(doc: str, repeats: int, **paths: str) -> argparse.Namespace:
     parser.add_argument("--repeats", type=int, default=repeats)
     for name, text in {"out": "JSON file to write", **paths}.items():
         parser.add_argument(f"--{name}", type=Path, help=text)
-    arithmetic().__enter__()  # until the program ends
+    UNTIL_THE_END.enter_context(arithmetic())
     return parser.parse_args()
 
 

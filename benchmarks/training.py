@@ -4,8 +4,9 @@ A run with everything on (learning, monitoring, checkpoints) is timed from its f
 last checkpoint, then a bare loop of `mj_step` calls with the same model and the wheel commands
 recorded from that run. Both alternate in one process; ratios are medians over the repeats. The
 learner starts with the stated number of rules and nothing learned, so that half of its decisions
-end at a wall, after some 5 steps instead of 10: the dearest phase of a run. `--run` measures a run
-of your own instead, from its newest checkpoint on.
+end at a wall, after some 5 steps instead of 10: the dearest phase of a run. Each row is measured
+with the experience replay of the presets and without it. `--run` measures a run of your own
+instead, from its newest checkpoint on.
 
     python benchmarks/training.py --out training.json
     python benchmarks/training.py --run runs/sga-sofnn-estimated-s0
@@ -16,6 +17,7 @@ import shutil
 import tempfile
 import time
 from collections.abc import Callable
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -41,9 +43,14 @@ def options_in(runs: Path) -> RunOptions:
     return RunOptions(runs=runs, picture_every=0, video_every=0, quiet=True)
 
 
-def fresh(name: str, rules: int, model: mujoco.MjModel | None, trials: int) -> Callable[..., Any]:
+def fresh(
+    name: str, rules: int, model: mujoco.MjModel | None, trials: int, replay: bool
+) -> Callable[..., Any]:
     """Return a function that begins a run in a directory."""
     config = preset(name, "sofnn", "default")
+    if not replay:
+        part = dataclasses.replace(getattr(config, name), replays=0)
+        config = dataclasses.replace(config, **{name: part})
     net = dataclasses.replace(config.net, max_rules=rules + 5_000)
     maze = dataclasses.replace(config.maze, max_steps=MAX_STEPS)
     config = dataclasses.replace(config, trials=trials, net=net, maze=maze)
@@ -142,11 +149,11 @@ def main() -> None:
         return
     reference = VARIANTS[0].build().model
     rows = []
-    for physics, model, trials, share in (("ours", None, 4, 1), ("reference", reference, 1, 3)):
-        for rules in SIZES:
-            for name in ("sga", "q"):
-                row = measure(fresh(name, rules, model, trials), max(3, options.repeats // share))
-                rows.append({"learner": name, "physics": physics} | row)
+    for physics, model, trials, share in (("ours", None, 4, 1), ("reference", reference, 2, 3)):
+        for replay, rules, name in product((True, False), SIZES, ("sga", "q")):
+            begin = fresh(name, rules, model, trials, replay)
+            row = {"learner": name, "physics": physics, "replay": "yes" if replay else "no"}
+            rows.append(row | measure(begin, max(3, options.repeats // share)))
     report(options, training=rows)
 
 

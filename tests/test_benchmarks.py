@@ -24,11 +24,15 @@ def test_training_is_measured_for_both_learners_and_both_physics(tmp_path, monke
     monkeypatch.setattr(sys, "argv", ["training.py", "--repeats", "1", "--out", str(out)])
     training.main()
     rows = json.loads(out.read_text())["training"]
-    assert [(row["physics"], row["learner"], row["steps"]) for row in rows] == [
-        ("ours", "sga", 160),
-        ("ours", "q", 160),
-        ("reference", "sga", 40),
-        ("reference", "q", 40),
+    assert [(row["physics"], row["replay"], row["learner"], row["steps"]) for row in rows] == [
+        ("ours", "yes", "sga", 160),
+        ("ours", "yes", "q", 160),
+        ("ours", "no", "sga", 160),
+        ("ours", "no", "q", 160),
+        ("reference", "yes", "sga", 80),
+        ("reference", "yes", "q", 80),
+        ("reference", "no", "sga", 80),
+        ("reference", "no", "q", 80),
     ]
     for row in rows:
         assert row["rules"] >= 30
