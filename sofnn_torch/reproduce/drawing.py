@@ -92,8 +92,8 @@ def _of_the_paper(data: Data) -> Iterator[tuple[str, Figure | None, str]]:
         figure, axes = figures.canvas(2, width=3.8, height=3.3)
         for ax, (agent, arms) in zip(axes, panels.items(), strict=True):
             figures.learning_curves(arms, ax, reference=optimum)
-            _legend_above(ax)
-            ax.set_title(f"{AGENTS[agent]}, SOFNN", y=1.1)
+            _legend_above(ax, columns=1)
+            ax.set_title(f"{AGENTS[agent]}, SOFNN", y=1.18)
         axes[1].sharey(axes[0])
         yield (
             "fig10",
@@ -116,10 +116,10 @@ def _of_the_paper(data: Data) -> Iterator[tuple[str, Figure | None, str]]:
         )
 
 
-def _legend_above(ax: Axes) -> None:
+def _legend_above(ax: Axes, columns: int = 2) -> None:
     """Where it covers nothing; matplotlib's search for such a place is slow with many curves."""
     with matplotlib.rc_context(figures.STYLE):
-        ax.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=2, borderaxespad=0.2)
+        ax.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=columns, borderaxespad=0.2)
 
 
 def _curves(data: Data, names: dict[str, str], quantity: str = "steps") -> dict[str, Any]:
