@@ -1,4 +1,4 @@
-"""Self-organizing fuzzy neural network (section 2 of the paper, equations 1-3).
+"""Self-organizing fuzzy neural network (section 2 of the paper, equations 1-4 and 10).
 
 One rule ``k`` owns one Gaussian membership function per input (centre ``u``, width ``v``) and a
 vector of consequents ``c``. For a state ``x``:
@@ -8,12 +8,8 @@ vector of consequents ``c``. For a state ``x``:
     S^k(x)     = F^k(x) / sum_l F^l(x)                    normalised firing
     y_j(x)     = sum_k S^k(x) c_j^k                       output            (eqs 4 and 10)
 
-Rules are the columns of a table with ``2 n + m`` rows ``[u_1..u_n, v_1..v_n, c_1..c_m]``: with
-the rules along the last axis every reduction over inputs is a vectorised sum, two to three times
-faster at batch size 1 than one row per rule. The Parameters in ``blocks`` are windows side by side
-into the one table; a full table appends a block as large as all before it together, so adding a
-rule costs a constant time on average, no Parameter is ever replaced, and no pass over the rules
-has to join the blocks first.
+A rule is added where equation 3 says that none covers the state. The numbers of the rules, their
+traces and the steps of learning in them are in `sofnn_torch.ruletable`.
 """
 
 import math
@@ -21,25 +17,19 @@ from collections.abc import Callable, Sequence
 from typing import Literal
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
+
+from sofnn_torch import batches
+from sofnn_torch.ruletable import RuleTable
 
 Growth = Literal["rule", "input", "literal", "frozen"]
-VIEWS = {"_active", "_centres", "_widths", "_consequents", "_traces", "_consequent_traces"}
-VIEWS |= {"_usage", "_learning"}
-BATCH = 32  # states from which on one product is faster than differences state by state
-PRECISION = 1e-4  # of the logarithm of a firing strength in such a product
 
 
-class SOFNN(nn.Module):
+class SOFNN(RuleTable):
     """Fuzzy network that adds a rule where no existing membership reaches ``theta``.
 
-    | Symbol | Shape | Meaning |
-    | --- | --- | --- |
-    | ``n``, ``m``, ``K``, ``B`` | | inputs, outputs, rules, batch |
-    | ``centres``, ``widths`` | (K, n) | antecedents ``u``, ``v`` in the units of the input |
-    | ``consequents`` | (K, m) | ``c``, what the rules conclude |
-    | ``traces`` | (2n+m, K) | eligibility trace of each parameter, kept beside it |
-    | ``usage`` | (K,) | sum of the normalised firing since it was last cleared |
+    `RuleTable` describes what the rules hold. Letters in shapes: ``n`` inputs, ``m`` outputs, ``K``
+    rules, ``B`` states in a batch, ``F`` features of a state.
 
     Args:
         n_inputs: number of inputs ``n``.
@@ -59,6 +49,7 @@ class SOFNN(nn.Module):
         max_rules: no rule is added beyond this many; ``refused`` counts the attempts.
         min_width: lower bound of adapted widths.
         block_size: rules in the first block.
+        dtype: of the parameters.
 
     Raises:
         ValueError: a setting is out of range; the message says which and what to do.
@@ -80,19 +71,20 @@ class SOFNN(nn.Module):
         block_size: int = 1024,
         dtype: torch.dtype = torch.float32,
     ):
-        super().__init__()
-        if n_inputs < 1 or n_outputs < 1:
-            raise ValueError("a network needs at least one input and one output")
+        super().__init__(
+            n_inputs,
+            n_outputs,
+            max_rules=max_rules,
+            min_width=min_width,
+            block_size=block_size,
+            shared=growth == "input",
+            dtype=dtype,
+        )
         if not 0.0 < theta < 1.0:
             raise ValueError(f"theta must lie between 0 and 1, got {theta}")
         if growth not in ("rule", "input", "literal", "frozen"):
             raise ValueError(f"growth must be rule, input, literal or frozen, got {growth!r}")
-        if max_rules < 1 or block_size < 1:
-            raise ValueError("max_rules and block_size must be at least 1")
-        self.n_inputs, self.n_outputs = n_inputs, n_outputs
-        self.growth, self.max_rules = growth, max_rules
-        self.theta, self.log_theta = theta, math.log(theta)
-        self.min_width, self.block_size, self.refused = min_width, block_size, 0
+        self.growth, self.theta, self.log_theta = growth, theta, math.log(theta)
         self.max_firing = 0.0  # at the last state observed
 
         def per(values, count: int, name: str) -> Tensor:
@@ -112,31 +104,13 @@ class SOFNN(nn.Module):
         if (periods < 0).any():
             raise ValueError("a period is positive, or 0 for an input that does not wrap")
         self.register_buffer("periods", periods, persistent=False)  # (n, 1)
-        frequencies = torch.where(periods > 0, 1 / periods, 0)
-        self.register_buffer("frequencies", frequencies, persistent=False)
-        self.wrapping = [
+        self.wrapping: batches.Wrapping = [
             (i, (1 / period).item(), period.item())
             for i, period in enumerate(periods)
             if period > 0
         ]
-        self.lengths = (2 * n_inputs + 1, *[2] * len(self.wrapping))  # of the features
-        self.parts = (n_inputs, n_inputs, n_outputs)  # rows of u, v and c in the table
-        rows = sum(self.parts)
-        self.register_buffer("traces_store", torch.zeros(rows, 0, dtype=dtype))
-        self.register_buffer("usage_store", torch.zeros(0, dtype=dtype))
-        self.register_buffer("labels_store", torch.zeros(n_inputs, 0, dtype=torch.long))
-        self._allocate([])
 
     # ---------------------------------------------------------------- inference, eqs 1, 2, 4, 10
-
-    def table(self) -> Tensor:
-        """All parameters of the active rules, differentiable. Shape: (2n+m, K)."""
-        if self.n_rules == 0:
-            raise ValueError("the network has no rules yet: call grow(x) or add_rule(centre)")
-        if not torch.is_grad_enabled():
-            return self._active
-        whole = self.blocks[0] if len(self.blocks) == 1 else torch.cat(list(self.blocks), 1)
-        return whole[:, : self.n_rules]
 
     def log_memberships(self, x: Tensor) -> Tensor:
         """Logarithm of equation 1 for x of shape (B, n). Shape: (B, n, K)."""
@@ -158,9 +132,9 @@ class SOFNN(nn.Module):
             antecedents: centres and widths, each (n, K); those of the network if None.
         """
         centres, widths = antecedents or self.table().split_with_sizes(self.parts)[:2]
-        if x.dim() == 2 and len(x) >= BATCH:
-            product = self._multiplied_out(self.features(x), self._quadratic(centres, widths))
-            return product.to(x.dtype).softmax(-1)
+        if x.dim() == 2 and len(x) >= batches.LARGE:
+            factors = batches.factors(centres, widths, self.wrapping)
+            return batches.log_firing(self.features(x), factors, self.wrapping).softmax(-1)
         return (-0.5 * self._squares(x, centres, widths).sum(-2)).softmax(-1)
 
     def firing_function(self) -> Callable[[Tensor], Tensor]:
@@ -168,14 +142,18 @@ class SOFNN(nn.Module):
 
         What depends on the antecedents alone is computed once, without a gradient.
         """
-        quadratic = self._quadratic(self._centres, self._widths)
+        factors = batches.factors(self._centres, self._widths, self.wrapping)
 
         def firing(features: Tensor) -> Tensor:
             flat = features.reshape(-1, features.shape[-1])
-            product = self._multiplied_out(flat, quadratic).to(features.dtype)
-            return product.softmax(-1).reshape(*features.shape[:-1], -1)
+            log_firing = batches.log_firing(flat, factors, self.wrapping)
+            return log_firing.softmax(-1).reshape(*features.shape[:-1], -1)
 
         return firing
+
+    def features(self, x: Tensor) -> Tensor:
+        """What `firing_function` takes, from states x (.., n). Shape: (.., F)."""
+        return batches.features(x, self.wrapping)
 
     def forward(self, x: Tensor) -> Tensor:
         """Weighted mean of the consequents (eqs 4, 10) for x of shape (B, n). Shape: (B, m)."""
@@ -196,50 +174,6 @@ class SOFNN(nn.Module):
         if tracked:
             return (difference / widths).square()
         return difference.div_(widths).square_()  # new memory costs as much as the arithmetic
-
-    def features(self, x: Tensor) -> Tensor:
-        """What log firing is a product of, at states x (.., n). Shape: (.., 2n+1 and 2 a period).
-
-        These are x^2, x and 1. Where an input wraps, a centre more than half a turn away is nearer
-        by 2 t (x - u - t / 2) / v^2 to x - t, one turn t further on: hence t^2 - 2 t x and t.
-        """
-        y = x - self._turns(x)
-        parts = [y * y, y, torch.ones_like(y[..., :1])]
-        for i, _, period in self.wrapping:
-            angle = y[..., i : i + 1]
-            t = torch.copysign(angle.new_tensor(period), angle.detach())
-            parts += [t * (t - 2 * angle), -t]
-        return torch.cat(parts, -1)
-
-    def _quadratic(self, centres: Tensor, widths: Tensor) -> Tensor:
-        """Log firing of every rule as a polynomial in x: factors of x^2, x and 1. Shape: (2n+1, K).
-
-        What cancels in it is as large as (u / v)^2 / 2, so it is in double precision where single
-        would leave an error above `PRECISION`.
-        """
-        u = centres - self._turns(centres.T).T
-        if 0.5 * (u / widths).square().sum(0).max() * torch.finfo(u.dtype).eps > PRECISION:
-            u, widths = u.double(), widths.double()
-        precision = widths.square().reciprocal()
-        weighted = precision * u
-        constant = (weighted * u).sum(0, keepdim=True)
-        return torch.cat([-0.5 * precision, weighted, -0.5 * constant])
-
-    def _multiplied_out(self, features: Tensor, quadratic: Tensor) -> Tensor:
-        """Log firing of every rule from the features (B, F) of states. Shape: (B, K)."""
-        whole, *turned = features.to(quadratic).split_with_sizes(self.lengths, 1)
-        if not turned:
-            return whole @ quadratic
-        # Only where it is nearer one turn further on does a rule gain from the turn.
-        gained = [
-            (part @ quadratic[i :: self.n_inputs][:2]).relu_()
-            for part, (i, _, _) in zip(turned, self.wrapping, strict=True)
-        ]
-        return torch.addmm(sum(gained[1:], gained[0]), whole, quadratic)
-
-    def _turns(self, values: Tensor) -> Tensor:
-        """The whole turns in values (.., n), which have no gradient. Shape: (.., n)."""
-        return (values.detach() * self.frequencies.T).round_() * self.periods.T
 
     # ------------------------------------------------------------------------- structure, eq. 3
 
@@ -323,17 +257,7 @@ class SOFNN(nn.Module):
         width = self.default_width if width is None else width
         if consequents is None:
             consequents = self._first_consequents(centre, log_firing)
-        column = torch.cat([centre, width, consequents])
-        numbers, n = column.tolist(), self.n_inputs
-        if not (math.isfinite(sum(map(abs, numbers))) and min(numbers[n : 2 * n]) > 0):
-            raise ValueError(f"a rule needs finite numbers and positive widths: {numbers}")
-        if k == self.capacity:
-            self._append_block(max(k, self.block_size))
-        self._whole.select(1, k).copy_(column)
-        if self.growth == "input":
-            fresh = self.labels.amax(1) + 1 if k else torch.zeros_like(self.labels_store[:, 0])
-            self.labels_store[:, k] = fresh if labels is None else labels
-        self._activate(k + 1)
+        self._append(torch.cat([centre, width, consequents]), labels)
         return True
 
     def _first_consequents(self, centre: Tensor, log_firing: Tensor | None) -> Tensor:
@@ -346,225 +270,17 @@ class SOFNN(nn.Module):
             firing = log_firing.softmax(0)
         return torch.where(self.interpolate, self.conclude(firing), self.initial)
 
-    @torch.no_grad()
-    def prune(self, keep: Tensor) -> int:
-        """Drop every rule where the mask keep (K,) is False; how many were dropped.
-
-        Raises:
-            ValueError: the mask has another length or would leave no rule.
-        """
-        if keep.shape != (self.n_rules,) or not keep.any():
-            raise ValueError(f"keep must be a mask of {self.n_rules} rules with at least one True")
-        table = self._active[:, keep]
-        stores = [s[..., : self.n_rules][..., keep] for s in self._stores()]
-        dropped, kept = self.n_rules - table.shape[1], table.shape[1]
-        self._allocate([max(kept, self.block_size)])
-        self._whole[:, :kept] = table
-        for store, values in zip(self._stores(), stores, strict=True):
-            store[..., :kept] = values
-        self._activate(kept)
-        return dropped
-
-    @torch.no_grad()
     def replace_rules(self, centres: Tensor, widths: Tensor, consequents: Tensor) -> None:
-        """Put these rules, for example edited ones, in the place of all; traces and usage are zero.
-
-        With the growth criterion ``input`` a membership function that was there before keeps its
-        label, and rules whose centre and width on an input are equal share one.
-
-        Args:
-            centres: Shape: (K, n).
-            widths: Shape: (K, n).
-            consequents: Shape: (K, m).
+        """Put these rules in the place of all: see `RuleTable.replace_rules`.
 
         Raises:
-            ValueError: a shape or number that no rule may have, no rule, more than ``max_rules``,
-                or another number of rules than a frozen structure has. Nothing is changed then.
+            ValueError: also if a frozen structure would get another number of rules.
         """
-        count, n = len(centres), self.n_inputs
-        parts = [part.to(self._whole) for part in (centres, widths, consequents)]
-        shapes = [tuple(part.shape) for part in parts]
-        if shapes != [(count, rows) for rows in self.parts] or not 1 <= count <= self.max_rules:
+        if self.growth == "frozen" and self.n_rules not in (0, len(centres)):
             raise ValueError(
-                f"need 1 to {self.max_rules} rules with {n} centres, {n} widths and "
-                f"{self.n_outputs} consequents each, got the shapes {shapes}"
+                f"a frozen structure keeps its {self.n_rules} rules, got {len(centres)}"
             )
-        if self.growth == "frozen" and self.n_rules not in (0, count):
-            raise ValueError(f"a frozen structure keeps its {self.n_rules} rules, got {count}")
-        table = torch.cat(parts, 1).T
-        if not (table.isfinite().all() and (table[n : 2 * n] >= self.min_width).all()):
-            raise ValueError(f"rules need finite numbers and widths of {self.min_width} or more")
-        labels = self._labels_for(table) if self.growth == "input" else 0
-        self._allocate([max(count, self.block_size)])
-        self._whole[:, :count] = table
-        self.labels_store[:, :count] = labels
-        self._activate(count)
-
-    def _labels_for(self, table: Tensor) -> Tensor:
-        """Which membership function each rule of another table (2n+m, K') uses. Shape: (n, K')."""
-        n, k, labels = self.n_inputs, self.n_rules, []
-        for i in range(n):
-            both = torch.cat([self._whole[:, :k], table], 1)[[i, n + i]]
-            functions, index = both.unique(dim=1, return_inverse=True)
-            first = int(self.labels[i].max()) + 1 if k else 0
-            label = torch.arange(first, first + functions.shape[1], device=table.device)
-            label[index[:k]] = self.labels[i]
-            labels.append(label[index[k:]])
-        return torch.stack(labels)
-
-    @property
-    def capacity(self) -> int:
-        """Rules that fit before the next block is appended."""
-        return self.usage_store.shape[0]
-
-    def _stores(self) -> tuple[Tensor, Tensor, Tensor]:
-        """What every rule carries beside its parameters, rules along the last axis."""
-        return self.traces_store, self.usage_store, self.labels_store
-
-    def _append_block(self, size: int) -> None:
-        self.blocks.append(nn.Parameter(self._whole.new_zeros(len(self._whole), size)))
-        for name in ("traces_store", "usage_store", "labels_store"):
-            store = getattr(self, name)
-            setattr(self, name, torch.cat([store, store.new_zeros(*store.shape[:-1], size)], -1))
-        self._join()
-
-    def _allocate(self, sizes: Sequence[int]) -> None:
-        self.blocks = nn.ParameterList()
-        for name in ("traces_store", "usage_store", "labels_store"):
-            setattr(self, name, getattr(self, name)[..., :0])
-        self.n_rules = 0
-        self._join()
-        for size in sizes:
-            self._append_block(size)
-
-    def _join(self) -> None:
-        """Make the blocks windows into one table, wherever their numbers were before."""
-        blocks = [block.detach() for block in self.blocks]
-        self._whole = torch.cat([torch.zeros_like(self.traces_store[:, :0]), *blocks], 1)
-        windows = self._whole.split_with_sizes([block.shape[1] for block in blocks], 1)
-        for block, window in zip(self.blocks, windows, strict=True):
-            block.data = window
-        self._activate(self.n_rules)
-
-    def _activate(self, n_rules: int) -> None:
-        """Set the number of rules; the views of what belongs to them are made when next needed."""
-        for name in VIEWS:
-            self.__dict__.pop(name, None)
-        self.__dict__["n_rules"] = n_rules  # past Module.__setattr__, which is slow
-
-    def __getattr__(self, name: str):
-        # A view costs as much as arithmetic on a thousand numbers: none is made twice.
-        if name not in VIEWS:
-            return super().__getattr__(name)
-        k, m = self.n_rules, self.n_outputs
-        active, traces = self._whole[:, :k], self.traces_store[:, :k]
-        centres, widths, consequents = active.split_with_sizes(self.parts)
-        last = traces[-m:]
-        self.__dict__.update(
-            _active=active,
-            _centres=centres,
-            _widths=widths,
-            _consequents=consequents,
-            _traces=traces,
-            _consequent_traces=last,
-            _usage=self.usage_store[:k],
-            # By the number of rows that learn.
-            _learning={m: (consequents, last), len(active): (active, traces)},
-        )
-        return self.__dict__[name]
-
-    def _apply(self, *arguments) -> "SOFNN":
-        super()._apply(*arguments)  # to another device or type, block by block
-        self._join()
-        return self
-
-    def __setstate__(self, state: dict) -> None:
-        super().__setstate__(state)  # a copy: the windows have become tables of their own
-        self._join()
-
-    # --------------------------------------------------------------- learning, eqs 6, 8, 14, 15
-
-    def learnable(self, antecedents: bool) -> Tensor:
-        """The parameters to differentiate by: the whole table, or its consequents alone.
-
-        Shape: (2n+m, K) with antecedents, (m, K) without; then the firing needs no gradient.
-        """
-        return (self._active if antecedents else self._consequents).detach().requires_grad_()
-
-    def accumulate(self, gradient: Tensor, decay: float, limit: float | None = None) -> None:
-        """E <- e + decay E (eq. 6) for the last rows of the table, as many as gradient has.
-
-        Args:
-            gradient: e, the gradient. Shape: (rows, K).
-            decay: gamma lambda.
-            limit: bound of the consequents' traces, None for no bound.
-        """
-        _, traces = self._learning[gradient.shape[0]]
-        traces.mul_(decay).add_(gradient)
-        if limit is not None:
-            self._consequent_traces.clamp_(-limit, limit)
-
-    def adapt(self, rates: Tensor, error: float = 1.0) -> None:
-        """W <- W + error rates E (eqs 8, 14, 15) for the last rows of the table.
-
-        Args:
-            rates: learning rate of each row. Shape: (rows, 1).
-            error: the reinforcement.
-        """
-        parameters, traces = self._learning[rates.shape[0]]
-        parameters.addcmul_(rates, traces, value=error)
-        if parameters is self._active:
-            self._widths.clamp_(min=self.min_width)
-
-    def adapt_batch(self, rates: Tensor, gradient: Tensor, mass: Tensor) -> None:
-        """W <- W + rates gradient / max(1, mass) for a gradient summed over a batch of states.
-
-        Dividing by the firing behind the sum makes a consequent move by the mean over the states
-        that it answers for, however many of them are in the batch.
-
-        Args:
-            rates: learning rate of each row. Shape: (rows, 1).
-            gradient: of the last rows of the table, as many as it has. Shape: (rows, K).
-            mass: summed firing that the gradient of a consequent holds. Shape: (K,) or (rows, K).
-        """
-        parameters, _ = self._learning[gradient.shape[0]]
-        parameters.add_(rates * gradient / mass.clamp(min=1.0))
-
-    def clamp_consequents(self, first: int, last: int, low: float, high: float) -> None:
-        """Keep the consequents first..last-1 of every rule between low and high."""
-        self._consequents[first:last].clamp_(low, high)
-
-    # ---------------------------------------------------------------------------- views and state
-
-    @property
-    def centres(self) -> Tensor:
-        """Centres u of the membership functions. Shape: (K, n)."""
-        return self._centres.T
-
-    @property
-    def widths(self) -> Tensor:
-        """Widths v of the membership functions. Shape: (K, n)."""
-        return self._widths.T
-
-    @property
-    def consequents(self) -> Tensor:
-        """Consequents c of the rules. Shape: (K, m)."""
-        return self._consequents.T
-
-    @property
-    def traces(self) -> Tensor:
-        """Eligibility traces E. Shape: (2n+m, K)."""
-        return self._traces
-
-    @property
-    def usage(self) -> Tensor:
-        """Sum of the normalised firing of each rule since it was last cleared. Shape: (K,)."""
-        return self._usage
-
-    @property
-    def labels(self) -> Tensor:
-        """Membership function that each rule uses for each input. Shape: (n, K)."""
-        return self.labels_store[:, : self.n_rules]
+        super().replace_rules(centres, widths, consequents)
 
     def statistics(self, max_firing: Sequence[float]) -> dict[str, float]:
         """Growth and use of the rules since the last call (docs/metrics.md).
@@ -580,30 +296,6 @@ class SOFNN(nn.Module):
             "rules/share_used": used,
             "rules/refused": float(self.refused),
         }
-
-    def get_extra_state(self) -> dict[str, int]:
-        """Rule count and refused growth, part of ``state_dict``."""
-        return {"n_rules": self.n_rules, "refused": self.refused}
-
-    def set_extra_state(self, state: dict[str, int]) -> None:
-        """Counterpart of `get_extra_state`."""
-        if not 0 <= state["n_rules"] <= self.capacity:
-            raise ValueError(f"{state['n_rules']} rules do not fit {self.capacity} columns")
-        self.refused = state["refused"]
-        self._activate(state["n_rules"])
-
-    def _load_from_state_dict(self, state_dict, prefix, local_metadata, *args) -> None:
-        if local_metadata.get("assign_to_params_buffers"):
-            raise ValueError(
-                "load_state_dict(assign=True) would tear the blocks apart: leave it out"
-            )
-        # Growing to the stored size first lets a fresh network load a grown one strictly.
-        sizes, i = [], 0
-        while (block := state_dict.get(f"{prefix}blocks.{i}")) is not None:
-            sizes.append(block.shape[-1])
-            i += 1
-        self._allocate(sizes)
-        super()._load_from_state_dict(state_dict, prefix, local_metadata, *args)
 
 
 def grid(
@@ -629,14 +321,11 @@ def grid(
     settings = {"width": [s / 2 for s in spacing], **settings, "growth": "frozen"}
     count = torch.Size(shape).numel()
     net = SOFNN(len(shape), n_outputs, block_size=count, max_rules=count, **settings)
-    like = net.default_width
     axes = [
         lo + step * (torch.arange(s, dtype=torch.float64) + 0.5)
         for lo, step, s in zip(lows, spacing, shape, strict=True)
     ]
-    centres = torch.cartesian_prod(*axes).reshape(count, len(shape)).to(like)
-    net._allocate([count])
-    columns = [centres, like.expand(count, -1), net.initial.expand(count, -1)]
-    net._whole.copy_(torch.cat(columns, 1).T)
-    net._activate(count)
+    centres = torch.cartesian_prod(*axes).reshape(count, len(shape))
+    per_rule = [row.expand(count, -1) for row in (net.default_width, net.initial)]
+    net.replace_rules(centres, *per_rule)
     return net

@@ -7,6 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from sofnn_torch import batches
 from sofnn_torch.sofnn import SOFNN, grid
 
 TAU = 2 * math.pi
@@ -90,8 +91,9 @@ def test_a_batch_in_one_product_is_as_exact_as_differences(dtype):
     net = grown(400, width=[0.01, 0.05, 0.5])
     exact = net.log_memberships(states(64, seed=2)).sum(1)
     centres, widths, _ = (t.to(dtype) for t in net.table().split_with_sizes(net.parts))
-    quadratic = net._quadratic(centres, widths)
-    product = net._multiplied_out(net.features(states(64, seed=2).to(dtype)), quadratic)
+    factors = batches.factors(centres, widths, net.wrapping)
+    features = net.features(states(64, seed=2).to(dtype))
+    product = batches.log_firing(features, factors, net.wrapping)
     precision = 3e4 * torch.finfo(dtype).eps  # (u / v)^2 is up to 1e4
     near = exact > -50  # the others never fire
     assert (product - exact)[near].abs().max() < precision
