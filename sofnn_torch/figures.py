@@ -352,6 +352,14 @@ def read_column(path: Path, column: str) -> NDArray[np.float64]:
     return np.array([float(words.get(row[column], row[column])) for row in rows])
 
 
+def logarithmic(ax: Axes, subs: Sequence[float] = (1, 2, 5)) -> None:
+    """A logarithmic vertical axis with plain numbers at some multiples of powers of ten."""
+    ax.set_yscale("log")
+    ax.yaxis.set_major_locator(LogLocator(subs=subs))
+    ax.yaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
+    ax.yaxis.set_minor_formatter(NullFormatter())
+
+
 @styled
 def learning_curves(
     arms: Mapping[str, Sequence[Path | NDArray[Any]]],
@@ -390,10 +398,7 @@ def learning_curves(
         place = {"xycoords": ("axes fraction", "data"), "ha": "right", "va": "top"}
         _note(ax, reference[0], (1, reference[1]), -2, **place)
     if column == "steps":
-        ax.set_yscale("log")
-        ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-        ax.yaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
-        ax.yaxis.set_minor_formatter(NullFormatter())
+        logarithmic(ax)
         if reference is not None:
             ax.set_ylim(bottom=0.75 * reference[1])
     ax.set(xlabel="trial", ylabel=label)

@@ -208,7 +208,7 @@ def robustness(data: Data, policy: str = "greedy") -> Figure:
                 ax.plot(values, middle, color=colour, linestyle=line, label=_name(arm), **style)
         axes[1, column].set_xlabel(group.replace(" [", "\n["))
     axes[0, 0].set(ylabel="success [%]", ylim=(-3, 103))
-    axes[1, 0].set(ylabel="steps, all trials", yscale="log")
-    axes[1, 0].yaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
+    axes[1, 0].set(ylabel="steps, all trials")
+    figures.logarithmic(axes[1, 0], subs=range(1, 10))
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper center", ncols=4)
     return figure
