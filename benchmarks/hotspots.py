@@ -3,7 +3,7 @@
 Each sample is counted for the innermost function of this project on the stack, with what it had
 called outside. `--checkout` profiles another checkout, for a before and after.
 
-    pip install py-spy
+    pip install -e ".[benchmark]"
     python benchmarks/hotspots.py --out hotspots.json
     python benchmarks/hotspots.py --flags "--agent q --trials 60" --checkout ../before
 """
