@@ -5,8 +5,9 @@ last checkpoint, then a bare loop of `mj_step` calls with the same model and the
 recorded from that run. Both alternate in one process; ratios are medians over the repeats. The
 learner starts with the stated number of rules and nothing learned, so that half of its decisions
 end at a wall, after some 5 steps instead of 10: the dearest phase of a run. Each row is measured
-with the experience replay of the presets and without it. `--run` measures a run of your own
-instead, from its newest checkpoint on.
+with the experience replay of the presets and without it, and with a learner that does nothing but
+repeat the actions of the run: what that leaves is what learning may cost. `--run` measures a run of
+your own instead, from its newest checkpoint on.
 
     python benchmarks/training.py --out training.json
     python benchmarks/training.py --run runs/sga-sofnn-estimated-s0
@@ -85,9 +86,10 @@ def timed_run(begin: Callable[..., Any]) -> float:
         return time.perf_counter() - start
 
 
-def recorded_run(begin: Callable[..., Any]) -> tuple[Commands, Session]:
-    """Return the wheel commands of a run, which are the same in every repeat, and the run."""
+def recorded_run(begin: Callable[..., Any]) -> tuple[Commands, list[Any], Session]:
+    """Return the wheel commands and actions of a run, the same in every repeat, and the run."""
     commands: Commands = []
+    actions: list[Any] = []
     with tempfile.TemporaryDirectory() as directory:
         begun = begin(Path(directory))
         physics = begun.env.physics
@@ -101,10 +103,27 @@ def recorded_run(begin: Callable[..., Any]) -> tuple[Commands, Session]:
             commands[-1].append((left / WHEEL_RADIUS, right / WHEEL_RADIUS))
             drive(left, right)
 
+        def noting(decide: Callable[..., Any]) -> Callable[..., Any]:
+            return lambda *given: actions.append(decide(*given)) or actions[-1]
+
+        agent = begun.agent
+        agent.start, agent.step = noting(agent.start), noting(agent.step)
         physics.place, physics.drive = note_place, note_drive
         training._loop(begun, options_in(Path(directory)), SignalTrap())
         physics.place, physics.drive = place, drive
-    return commands, begun
+    return commands, actions, begun
+
+
+def idle(begin: Callable[..., Any], actions: list[Any]) -> Callable[..., Any]:
+    """Return a function that begins the same run with a learner that only repeats its actions."""
+
+    def begin_idle(runs: Path) -> Session:
+        begun, given = begin(runs), iter(actions)
+        begun.agent.start = begun.agent.step = lambda *_: next(given)
+        begun.agent.statistics = dict
+        return begun
+
+    return begin_idle
 
 
 def bare(physics: Physics, commands: Commands) -> float:
@@ -123,16 +142,20 @@ def bare(physics: Physics, commands: Commands) -> float:
 
 def measure(begin: Callable[..., Any], repeats: int) -> dict[str, Any]:
     """Return the times of a run and of its physics."""
-    commands, begun = recorded_run(begin)
-    steps = sum(map(len, commands))
-    times = [(timed_run(begin), bare(begun.env.physics, commands)) for _ in range(repeats)]
-    full, alone = np.array(times).T / steps * 1e6
+    commands, actions, begun = recorded_run(begin)
+    steps, begin_idle = sum(map(len, commands)), idle(begin, actions)
+    times = [
+        (timed_run(begin), timed_run(begin_idle), bare(begun.env.physics, commands))
+        for _ in range(repeats)
+    ]
+    full, rest, alone = np.array(times).T / steps * 1e6
     return {
         "rules": begun.agent.net.n_rules,
         "steps": steps,
         "bare us/step": median(alone),
         "training us/step": median(full),
         "ratio": ratio(alone, full),
+        "idle learner": ratio(alone, rest),
     }
 
 
