@@ -428,7 +428,8 @@ def test_data_of_runs_become_a_page(tmp_path, monkeypatch):
     assert command.run(command.Options(**options)) == 0
     both = results.read(out, "growth").info["made_with"]
     assert both == [made, made.replace("0-1", "0")]
-    assert "| sga-rule |" in (out / "growth.md").read_text()
+    page = (out / "growth.md").read_text()
+    assert "| sga-rule |" in page and "Runs of 2 trials." in page
     assert "growth.md" in (out / "README.md").read_text()
 
 

@@ -112,7 +112,9 @@ def page(out: Path, data: Data) -> str:
     """The page of a study; its figures are drawn into the directory."""
     info, study = data.info, STUDIES[data.info["study"]]
     limit = max(arm["config"]["maze"]["max_steps"] for arm in info["arms"].values())
-    parts = [f"# {info['title']}", info["about"]]
+    trials = sorted({arm["config"]["trials"] for arm in info["arms"].values()})
+    length = f"Runs of {' or '.join(map(str, trials))} trials."
+    parts = [f"# {info['title']}", f"{info['about']} {length}"]
     if info["quick"]:
         parts.append("**A quick look with short runs: the numbers mean nothing.**")
     if study.figures:
