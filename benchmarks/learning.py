@@ -22,6 +22,7 @@ import torch
 from timing import arguments, interleaved, median, ratio, report
 
 from sofnn_torch.config import Agent, make_agent, preset
+from sofnn_torch.session import arithmetic
 from sofnn_torch.sofnn import SOFNN
 
 SIZES = (1_000, 10_000)
@@ -174,6 +175,7 @@ def plot(path: Path, rows: list[dict[str, Any]]) -> None:
     figure.savefig(path, dpi=110)
 
 
+@arithmetic()
 def main() -> None:
     """Measure, print tables, and write them as JSON."""
     options = arguments(__doc__, repeats=15, plot="PNG file to write")

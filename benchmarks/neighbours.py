@@ -21,6 +21,7 @@ from timing import arguments, interleaved, median, ratio, report
 from torch import Tensor
 
 from sofnn_torch.config import preset
+from sofnn_torch.session import arithmetic
 from sofnn_torch.sofnn import SOFNN
 
 SIZES = (1_000, 10_000, 100_000)
@@ -60,6 +61,7 @@ def error(net: SOFNN, cells: Cells, xs: Tensor) -> float:
     return max(0.0, *missed)
 
 
+@arithmetic()
 def main() -> None:
     """Measure, print a table, and write it as JSON."""
     options = arguments(__doc__, repeats=15)

@@ -1,7 +1,6 @@
 """What the benchmarks share: interleaved timing, the machine, JSON."""
 
 import argparse
-import contextlib
 import gc
 import json
 import os
@@ -14,10 +13,6 @@ from typing import Any
 import mujoco
 import numpy as np
 import torch
-
-from sofnn_torch.session import arithmetic
-
-UNTIL_THE_END = contextlib.ExitStack()
 
 
 def interleaved(
@@ -65,12 +60,11 @@ def median(values: np.ndarray) -> float:
 
 
 def arguments(doc: str, repeats: int, **paths: str) -> argparse.Namespace:
-    """The options of every benchmark and paths with their help; sets up torch as in training."""
+    """The options of every benchmark, and paths with their help."""
     parser = argparse.ArgumentParser(description=doc.splitlines()[0])
     parser.add_argument("--repeats", type=int, default=repeats)
     for name, text in {"out": "JSON file to write", **paths}.items():
         parser.add_argument(f"--{name}", type=Path, help=text)
-    UNTIL_THE_END.enter_context(arithmetic())
     return parser.parse_args()
 
 

@@ -19,6 +19,7 @@ from neuro_fuzzy_toolbox.func import Gaussian_MF
 from neuro_fuzzy_toolbox.models.anfis import rule_reduced_ANFIS
 from timing import arguments, interleaved, median, ratio, report
 
+from sofnn_torch.session import arithmetic
 from sofnn_torch.sofnn import SOFNN
 
 
@@ -51,6 +52,7 @@ def additions(net: SOFNN, toolbox: rule_reduced_ANFIS) -> dict[str, Callable[[],
     }
 
 
+@arithmetic()
 def main() -> None:
     """Measure, print a table, and write it as JSON."""
     options = arguments(__doc__, repeats=5)

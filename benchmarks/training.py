@@ -33,7 +33,7 @@ from sofnn_torch.config import preset
 from sofnn_torch.guard import SignalTrap
 from sofnn_torch.odometry import WHEEL_RADIUS
 from sofnn_torch.physics import Physics
-from sofnn_torch.session import RunOptions, Session
+from sofnn_torch.session import RunOptions, Session, arithmetic
 
 MAX_STEPS = 2_000  # of a trial
 Commands = list[list[tuple[float, float]]]  # of both wheels [rad/s], trial by trial
@@ -159,6 +159,7 @@ def measure(begin: Callable[..., Any], repeats: int) -> dict[str, Any]:
     }
 
 
+@arithmetic()
 def main() -> None:
     """Measure, print a table, and write it as JSON."""
     options = arguments(__doc__, repeats=7, run="a run directory to measure instead")
