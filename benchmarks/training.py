@@ -5,9 +5,10 @@ last checkpoint, then a bare loop of `mj_step` calls with the same model and the
 recorded from that run. Both alternate in one process; ratios are medians over the repeats. The
 learner starts with the stated number of rules and nothing learned, so that half of its decisions
 end at a wall, after some 5 steps instead of 10: the dearest phase of a run. Each row is measured
-with the experience replay of the presets and without it, and with a learner that does nothing but
-repeat the actions of the run: what that leaves is what learning may cost. `--run` measures a run of
-your own instead, from its newest checkpoint on.
+with the experience replay of the presets and without it, and with two stand-ins for the learner
+that repeat the actions of the run. One does nothing else: what it leaves is what learning may cost.
+The other runs the minimal forward and backward pass of `learning.py` at each decision. `--run`
+measures a run of your own instead, from its newest checkpoint on.
 
     python benchmarks/training.py --out training.json
     python benchmarks/training.py --run runs/sga-sofnn-estimated-s0
@@ -24,7 +25,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from learning import SIZES, fill
+from learning import SIZES, fill, minimal
 from physics import VARIANTS
 from timing import arguments, median, ratio, report
 
@@ -114,16 +115,26 @@ def recorded_run(begin: Callable[..., Any]) -> tuple[Commands, list[Any], Sessio
     return commands, actions, begun
 
 
-def idle(begin: Callable[..., Any], actions: list[Any]) -> Callable[..., Any]:
-    """Return a function that begins the same run with a learner that only repeats its actions."""
+def scripted(
+    begin: Callable[..., Any], actions: list[Any], beside: Callable[[], Any]
+) -> Callable[..., Any]:
+    """Return a function that begins the same run with a stand-in for the learner.
 
-    def begin_idle(runs: Path) -> Session:
+    It repeats the given actions and does what stands beside before each.
+    """
+
+    def begin_scripted(runs: Path) -> Session:
         begun, given = begin(runs), iter(actions)
-        begun.agent.start = begun.agent.step = lambda *_: next(given)
+
+        def decide(*_: Any) -> Any:
+            beside()
+            return next(given)
+
+        begun.agent.start = begun.agent.step = decide
         begun.agent.statistics = dict
         return begun
 
-    return begin_idle
+    return begin_scripted
 
 
 def bare(physics: Physics, commands: Commands) -> float:
@@ -143,19 +154,22 @@ def bare(physics: Physics, commands: Commands) -> float:
 def measure(begin: Callable[..., Any], repeats: int) -> dict[str, Any]:
     """Return the times of a run and of its physics."""
     commands, actions, begun = recorded_run(begin)
-    steps, begin_idle = sum(map(len, commands)), idle(begin, actions)
+    net, steps = begun.agent.net, sum(map(len, commands))
+    passes = minimal(net.n_rules, net.n_outputs)
+    idle, least = (scripted(begin, actions, beside) for beside in (lambda: None, passes))
     times = [
-        (timed_run(begin), timed_run(begin_idle), bare(begun.env.physics, commands))
+        (*map(timed_run, (begin, idle, least)), bare(begun.env.physics, commands))
         for _ in range(repeats)
     ]
-    full, rest, alone = np.array(times).T / steps * 1e6
+    full, nothing, bound, alone = np.array(times).T / steps * 1e6
     return {
-        "rules": begun.agent.net.n_rules,
+        "rules": net.n_rules,
         "steps": steps,
         "bare us/step": median(alone),
         "training us/step": median(full),
         "ratio": ratio(alone, full),
-        "idle learner": ratio(alone, rest),
+        "minimal passes": ratio(alone, bound),
+        "idle learner": ratio(alone, nothing),
     }
 
 

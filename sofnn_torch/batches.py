@@ -23,31 +23,40 @@ Wrapping = Sequence[tuple[int, float, float]]
 def features(x: Tensor, wrapping: Wrapping) -> Tensor:
     """What log firing is a product of, at states x (.., n). Shape: (.., 2n+1 and 2 a period).
 
-    These are x^2, x and 1. Where an input wraps, a centre more than half a turn away is nearer
-    by 2 t (x - u - t / 2) / v^2 to x - t, one turn t further on: hence t^2 - 2 t x and t.
+    These are -x^2 / 2, x and -1/2. Where an input wraps, a centre more than half a turn away is
+    nearer to x - t, one turn t further on, and gains t (x - t / 2 - u) / v^2.
     """
     y = _unwound(x, wrapping)
-    parts = [y * y, y, torch.ones_like(y[..., :1])]
+    parts = [-0.5 * y * y, y, torch.full_like(y[..., :1], -0.5)]
     for i, _, period in wrapping:
         angle = y[..., i : i + 1]
         t = torch.copysign(angle.new_tensor(period), angle.detach())
-        parts += [t * (t - 2 * angle), -t]
+        parts += [t * (angle - 0.5 * t), -t]
     return torch.cat(parts, -1)
 
 
 def factors(centres: Tensor, widths: Tensor, wrapping: Wrapping) -> Tensor:
-    """Factors of x^2, x and 1 in the log firing of each rule. Shape: (2n+1, K).
+    """What log firing is a product of, for each rule: 1 / v^2, u / v^2, sum u^2 / v^2.
 
-    What cancels in the product is as large as (u / v)^2 / 2, so they are in double precision where
-    single would leave an error above `PRECISION`. Centres and widths are of shape (n, K).
+    What cancels in the product is as large as the last, so they are in double precision where
+    single would leave an error above `PRECISION`.
+
+    Args:
+        centres: Shape: (n, K).
+        widths: Shape: (n, K).
+        wrapping: inputs that wrap.
+
+    Returns:
+        Shape: (2n+1, K).
     """
     u = _unwound(centres.T, wrapping).T
-    if 0.5 * (u / widths).square().sum(0).max() * torch.finfo(u.dtype).eps > PRECISION:
-        u, widths = u.double(), widths.double()
     precision = widths.square().reciprocal()
     weighted = precision * u
     constant = (weighted * u).sum(0, keepdim=True)
-    return torch.cat([-0.5 * precision, weighted, -0.5 * constant])
+    error = 0.5 * constant.detach().max() * torch.finfo(u.dtype).eps
+    if error > PRECISION and u.dtype != torch.double:
+        return factors(centres.double(), widths.double(), wrapping)
+    return torch.cat([precision, weighted, constant])
 
 
 def log_firing(features: Tensor, factors: Tensor, wrapping: Wrapping) -> Tensor:
@@ -67,7 +76,8 @@ def log_firing(features: Tensor, factors: Tensor, wrapping: Wrapping) -> Tensor:
 
 def _unwound(values: Tensor, wrapping: Wrapping) -> Tensor:
     """Values (.., n) less whole turns, which have no gradient. Shape: (.., n)."""
-    values = values.clone()
+    if wrapping:
+        values = values.clone()
     for i, frequency, period in wrapping:
         angle = values.detach().select(-1, i)
         angle.sub_((angle * frequency).round_().mul_(period))

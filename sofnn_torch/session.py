@@ -17,6 +17,7 @@ from sofnn_torch.maze import KheperaMazeEnv
 from sofnn_torch.monitoring import TrialRecord
 from sofnn_torch.runs import Run, load_config, same_settings
 
+LARGE_BLOCK = 2**25 - 2**14  # bytes; just below the largest block that glibc learns to keep
 WINDOW = 10  # trials that decide which checkpoint is the best
 
 
@@ -109,11 +110,13 @@ def arithmetic(threads: int = 1) -> Iterator[None]:
     """Set torch's number of threads; inside, results below 1e-38 count as 0. Also a decorator.
 
     Firing strengths and traces far from the state are full of such denormal numbers, for which
-    processors take many times as long.
+    processors take many times as long. Nor does memory go back to the system after each batch: new
+    pages cost as much as the arithmetic on them.
     """
     flushed = bool(torch.tensor(1e-30) * 1e-10 == 0)
     torch.set_flush_denormal(True)  # first: threads inherit it when they are made
     torch.set_num_threads(threads)
+    torch.empty(LARGE_BLOCK, dtype=torch.uint8)  # freed at once; glibc keeps blocks of its size
     try:
         yield
     finally:

@@ -10,6 +10,7 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 
+import compiled
 import learning
 import neighbours
 import training
@@ -37,6 +38,7 @@ def test_training_is_measured_for_both_learners_and_both_physics(tmp_path, monke
     for row in rows:
         assert row["rules"] >= 30
         assert 0 < row["ratio"] < row["idle learner"] < 1
+        assert row["minimal passes"] < row["idle learner"]
         assert row["bare us/step"] < row["training us/step"]
     assert "reference" in capsys.readouterr().out  # the table
 
@@ -63,3 +65,24 @@ def test_the_near_rules_miss_no_more_than_the_bound():
     near = [len(cells.near(x)[0]) for x in xs[:200]]
     assert max(near) < net.n_rules
     torch.testing.assert_close(cells.conclude(xs[0]), net(xs[:1])[0], rtol=0.01, atol=0.01)
+
+
+def test_the_decision_to_compile_learns_what_the_learner_learns():
+    agents = [learning.learner("sga", 200) for _ in range(2)]
+    for agent in agents:
+        agent.net.usage.zero_()
+    xs, noise = torch.from_numpy(learning.states(20, seed=4)), agents[0].rng.bit_generator.state
+    agents[0].start(xs[0].numpy())
+    for x in xs[1:]:
+        agents[0].step(0.5, x.numpy(), False)
+    agents[1].rng.bit_generator.state = noise
+    decision = compiled.Decision(agents[1])
+    for i, x in enumerate(xs):
+        draw = torch.tensor([agents[1].rng.standard_normal()], dtype=torch.float32)
+        # Before the first decision the traces are zero: the reward changes nothing.
+        decision.step(torch.tensor(0.5 * (i > 0)), x, draw)
+    assert agents[0].net.traces.abs().max() > 1e-3
+    for name in ("consequents", "traces", "usage"):
+        torch.testing.assert_close(
+            *(getattr(agent.net, name) for agent in agents), rtol=1e-4, atol=1e-6
+        )
