@@ -21,7 +21,8 @@ import numpy as np
 import torch
 from timing import arguments, interleaved, median, ratio, report
 
-from sofnn_torch.config import Agent, make_agent, preset
+from sofnn_torch.factory import Agent, make_agent
+from sofnn_torch.presets import preset
 from sofnn_torch.session import arithmetic
 from sofnn_torch.sofnn import SOFNN
 

@@ -20,7 +20,7 @@ from learning import fill, states
 from timing import arguments, interleaved, median, ratio, report
 from torch import Tensor
 
-from sofnn_torch.config import preset
+from sofnn_torch.presets import preset
 from sofnn_torch.session import arithmetic
 from sofnn_torch.sofnn import SOFNN
 

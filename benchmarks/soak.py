@@ -19,8 +19,8 @@ import psutil
 import tyro
 
 from sofnn_torch import figures, training
-from sofnn_torch.config import preset
 from sofnn_torch.guard import Interrupted
+from sofnn_torch.presets import preset
 from sofnn_torch.session import RunOptions
 
 

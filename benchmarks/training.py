@@ -30,10 +30,10 @@ from physics import VARIANTS
 from timing import arguments, median, ratio, report
 
 from sofnn_torch import session, training
-from sofnn_torch.config import preset
 from sofnn_torch.guard import SignalTrap
 from sofnn_torch.odometry import WHEEL_RADIUS
 from sofnn_torch.physics import Physics
+from sofnn_torch.presets import preset
 from sofnn_torch.session import RunOptions, Session, arithmetic
 
 MAX_STEPS = 2_000  # of a trial

@@ -4,8 +4,8 @@ import sys
 from pathlib import Path
 
 from sofnn_torch import figures
-from sofnn_torch.config import make_env
 from sofnn_torch.evaluate import load
+from sofnn_torch.factory import make_env
 from sofnn_torch.physics import load_model
 from sofnn_torch.policy import FrozenPolicy
 from sofnn_torch.rendering import OffscreenRenderer

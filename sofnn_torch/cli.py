@@ -19,9 +19,10 @@ if __name__ == "__main__":  # Ctrl-C while libraries load: there is nothing to s
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 from sofnn_torch import runs, seeds, training
-from sofnn_torch.config import Config, preset
+from sofnn_torch.config import Config
 from sofnn_torch.flags import parse as parse_flags
 from sofnn_torch.guard import Divergence, Interrupted
+from sofnn_torch.presets import preset
 from sofnn_torch.session import RunOptions, saved_config
 
 EXAMPLES = """Train a robot to find its way with a self-organizing fuzzy neural network.

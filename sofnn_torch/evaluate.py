@@ -25,7 +25,8 @@ from rich.table import Table
 from scipy import stats
 
 from sofnn_torch import checkpoint
-from sofnn_torch.config import Agent, Config, make_agent, make_env
+from sofnn_torch.config import Config
+from sofnn_torch.factory import Agent, make_agent, make_env
 from sofnn_torch.flags import command
 from sofnn_torch.monitoring import TrialRecord, film, gif
 from sofnn_torch.optimum import optimal_steps

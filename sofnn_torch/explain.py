@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from sofnn_torch.config import Agent
+from sofnn_torch.factory import Agent
 from sofnn_torch.sga import SGA
 from sofnn_torch.survey import survey
 

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from sofnn_torch.survey import survey
 
 if TYPE_CHECKING:
-    from sofnn_torch.config import Agent
+    from sofnn_torch.factory import Agent
     from sofnn_torch.monitoring import Trajectory
     from sofnn_torch.physics import MazePlan
 

@@ -9,7 +9,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from sofnn_torch.config import Agent
+from sofnn_torch.factory import Agent
 
 FARTHEST = 100.0  # metres, radians: no rule out there ever fires
 WIDEST = 50.0  # times the width of a new rule: it fires everywhere and no more rules are added

@@ -22,8 +22,9 @@ from tensorboard.compat.proto.summary_pb2 import Summary
 from torch.utils.tensorboard.summary import hparams
 
 from sofnn_torch import figures
-from sofnn_torch.config import Agent, Config, make_env
+from sofnn_torch.config import Config
 from sofnn_torch.events import EventFile
+from sofnn_torch.factory import Agent, make_env
 from sofnn_torch.physics import load_model
 from sofnn_torch.policy import FrozenPolicy
 from sofnn_torch.rendering import OffscreenRenderer

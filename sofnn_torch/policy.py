@@ -4,7 +4,7 @@ from collections import Counter
 
 import numpy as np
 
-from sofnn_torch.config import Agent
+from sofnn_torch.factory import Agent
 
 PATIENCE = 3  # returns that a sound way may need: a turn, a coarse grid
 MOST = 10  # doublings: by then every action is about as likely

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sofnn_torch.config import Agent
+from sofnn_torch.factory import Agent
 from sofnn_torch.guard import FARTHEST, LARGEST, WIDEST
 from sofnn_torch.sga import SGA
 

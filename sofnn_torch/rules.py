@@ -25,9 +25,10 @@ from rich.console import Console
 from rich.table import Table
 
 from sofnn_torch import checkpoint, explain, figures, rulefiles
-from sofnn_torch.config import Agent, Config, make_env
+from sofnn_torch.config import Config
 from sofnn_torch.evaluate import load
 from sofnn_torch.explain import Decision, Reading, number
+from sofnn_torch.factory import Agent, make_env
 from sofnn_torch.flags import command
 from sofnn_torch.runs import Run, first_free
 from sofnn_torch.session import RunOptions, arithmetic

@@ -12,7 +12,8 @@ import torch
 
 from sofnn_torch import checkpoint
 from sofnn_torch.checkpoint import CheckpointError
-from sofnn_torch.config import Agent, Config, from_dict, make_agent, make_env
+from sofnn_torch.config import Config, from_dict
+from sofnn_torch.factory import Agent, make_agent, make_env
 from sofnn_torch.maze import KheperaMazeEnv
 from sofnn_torch.monitoring import TrialRecord
 from sofnn_torch.runs import Run, load_config, same_settings

@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from sofnn_torch.config import Agent
+    from sofnn_torch.factory import Agent
 
 CHUNK = 512  # states at a time: memory stays near CHUNK x rules numbers
 

@@ -15,7 +15,8 @@ import numpy as np
 from tqdm import tqdm
 
 from sofnn_torch import checkpoint, session
-from sofnn_torch.config import Agent, Config, from_dict
+from sofnn_torch.config import Config, from_dict
+from sofnn_torch.factory import Agent
 from sofnn_torch.guard import Divergence, Interrupted, SignalTrap, diagnose, physics_warnings
 from sofnn_torch.monitoring import Monitor, Trajectory, TrialRecord
 from sofnn_torch.policy import FrozenPolicy

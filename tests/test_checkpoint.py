@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from sofnn_torch import checkpoint, training
 from sofnn_torch.checkpoint import CheckpointError
 from sofnn_torch.cli import main
-from sofnn_torch.config import make_agent, make_env
+from sofnn_torch.factory import make_agent, make_env
 from sofnn_torch.runs import Run
 
 

@@ -19,7 +19,9 @@ from hypothesis import strategies as st
 
 from sofnn_torch import checkpoint, cli, seeds, training
 from sofnn_torch.cli import main, parse
-from sofnn_torch.config import Config, from_dict, make_agent, preset
+from sofnn_torch.config import Config, from_dict
+from sofnn_torch.factory import make_agent
+from sofnn_torch.presets import preset
 from sofnn_torch.runs import load_config
 
 ROOT = Path(__file__).parents[1]

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from sofnn_torch import evaluate, flags
-from sofnn_torch.config import preset
 from sofnn_torch.monitoring import TrialRecord
+from sofnn_torch.presets import preset
 from sofnn_torch.rendering import RenderingError
 from sofnn_torch.training import RunOptions, train
 

@@ -20,7 +20,7 @@ from conftest import equal, quick_options, settings
 
 from sofnn_torch import checkpoint, monitoring, training
 from sofnn_torch.checkpoint import CheckpointError
-from sofnn_torch.config import make_agent, make_env
+from sofnn_torch.factory import make_agent, make_env
 from sofnn_torch.guard import Divergence, Interrupted
 from sofnn_torch.runs import Run, default_name, load_config
 from sofnn_torch.training import play

@@ -11,8 +11,9 @@ from matplotlib.patches import Rectangle
 from PIL import Image
 
 from sofnn_torch import figures
-from sofnn_torch.config import make_agent, make_env, preset
+from sofnn_torch.factory import make_agent, make_env
 from sofnn_torch.monitoring import Trajectory
+from sofnn_torch.presets import preset
 from sofnn_torch.survey import survey, usage
 
 RNG = np.random.default_rng(7)

@@ -14,9 +14,10 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
 
 from sofnn_torch import monitoring
-from sofnn_torch.config import make_agent, make_env, preset
 from sofnn_torch.events import EventFile
+from sofnn_torch.factory import make_agent, make_env
 from sofnn_torch.monitoring import Monitor, Trajectory, film, gif
+from sofnn_torch.presets import preset
 from sofnn_torch.rendering import RenderingError
 from sofnn_torch.training import play
 

@@ -19,7 +19,7 @@ from PIL import Image
 from rich.console import Console
 
 from sofnn_torch import checkpoint, evaluate, explain, rulefiles, rules, training
-from sofnn_torch.config import make_agent
+from sofnn_torch.factory import make_agent
 from sofnn_torch.runs import load_config
 from sofnn_torch.sofnn import SOFNN
 

@@ -16,7 +16,7 @@ import torch
 from conftest import equal, quick_options, scalars, settings
 
 from sofnn_torch import checkpoint, training
-from sofnn_torch.config import make_env
+from sofnn_torch.factory import make_env
 from sofnn_torch.runs import load_config
 from sofnn_torch.session import arithmetic, build
 from sofnn_torch.training import RunOptions, play

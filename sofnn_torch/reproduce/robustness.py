@@ -9,7 +9,8 @@ import gymnasium
 import numpy as np
 
 from sofnn_torch import evaluate
-from sofnn_torch.config import Config, make_env
+from sofnn_torch.config import Config
+from sofnn_torch.factory import make_env
 from sofnn_torch.training import play
 
 EPISODES = 10

@@ -15,7 +15,8 @@ from joblib import Parallel, delayed
 from tqdm import tqdm
 
 from sofnn_torch import checkpoint, evaluate, runs, seeds, training
-from sofnn_torch.config import Config, from_dict, make_agent, make_env
+from sofnn_torch.config import Config, from_dict
+from sofnn_torch.factory import make_agent, make_env
 from sofnn_torch.figures import read_column
 from sofnn_torch.guard import Divergence, Interrupted, SignalTrap
 from sofnn_torch.monitoring import Trajectory, TrialRecord

@@ -8,7 +8,8 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from sofnn_torch.config import Config, NetworkConfig, QConfig, SGAConfig, preset
+from sofnn_torch.config import Config, NetworkConfig, QConfig, SGAConfig
+from sofnn_torch.presets import preset
 from sofnn_torch.runs import flatten
 
 Arm = dict[str, Any]
