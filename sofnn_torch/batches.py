@@ -39,7 +39,7 @@ def factors(centres: Tensor, widths: Tensor, wrapping: Wrapping) -> Tensor:
     """What log firing is a product of, for each rule: 1 / v^2, u / v^2, sum u^2 / v^2.
 
     What cancels in the product is as large as the last, so they are in double precision where
-    single would leave an error above `PRECISION`.
+    single would leave an error above `PRECISION` at states no farther out than the centres.
 
     Args:
         centres: Shape: (n, K).

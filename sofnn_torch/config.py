@@ -82,6 +82,9 @@ class SGAConfig:
     """Upper bound of sigma."""
     mean_limit: float = 1.0
     """Bound of |mu|."""
+    value_limit: float | None = 2.0
+    """Bound of |value| of the following state in the TD error, twice the goal's reward; None for
+    no bound."""
     replays: int = 100
     """Batches of remembered decisions to learn from again at the beginning of each trial; 0 for
     none. Needs baseline `value`."""
@@ -156,9 +159,9 @@ class MazeConfig:
     step_reward: float = 0.0
     """Reward of every decision."""
     wheel_radius_scale: float = 1.0
-    """Miscalibration: true wheel radius over the one the robot believes in."""
+    """Miscalibration: the wheel radius that the robot believes in over the true one."""
     wheel_base_scale: float = 1.0
-    """Miscalibration: true wheel base over the one the robot believes in."""
+    """Miscalibration: the wheel base that the robot believes in over the true one."""
 
 
 @dataclass(frozen=True)
@@ -203,6 +206,12 @@ class Config:
             raise ValueError("need --sga.sigma-min <= --sga.sigma-initial <= --sga.sigma-max")
         if sga.replays and sga.baseline == "constant":
             raise ValueError("--sga.replays needs --sga.baseline value: set --sga.replays 0")
+        learner, reward = (q if self.agent == "q" else sga), self.maze.goal_reward
+        if learner.value_limit is not None and learner.value_limit < reward:
+            raise ValueError(
+                f"--{self.agent}.value-limit {learner.value_limit:g} must be at least "
+                f"--maze.goal-reward {reward:g}, or None"
+            )
         if q.actions == "three" and q.segments != 3:
             raise ValueError("--q.actions three needs --q.segments 3")
         if self.network == "fixed":

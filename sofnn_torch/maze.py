@@ -306,7 +306,7 @@ class KheperaMazeEnv(gymnasium.Env[np.ndarray, Any]):
     def _build_observation_space(self) -> gymnasium.spaces.Box:
         # Without its guard an estimate may leave the arena, by at most what a trial can drive.
         free = self.pose_mode != "true" and not self.estimator.guarded
-        reach = self.max_steps * FORWARD_SPEED * self.wheel_radius_scale * free
+        reach = self.max_steps * STEP_SECONDS * FORWARD_SPEED * self.wheel_radius_scale * free
         low = [-reach, -reach, -math.pi]
         high = [self.plan.size[0] + reach, self.plan.size[1] + reach, math.pi]
         if self.range_sensors:

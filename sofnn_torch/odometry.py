@@ -13,7 +13,8 @@ Pose = tuple[float, float, float]
 
 def wrap_angle(angle: float) -> float:
     """Return the same direction in [-pi, pi)."""
-    return (angle + math.pi) % (2.0 * math.pi) - math.pi
+    wrapped = (angle + math.pi) % (2.0 * math.pi) - math.pi
+    return wrapped if wrapped < math.pi else -math.pi  # the remainder may round up to the divisor
 
 
 def advance(pose: Pose, distance: float, turn: float) -> Pose:

@@ -124,8 +124,8 @@ class Physics:
         self._qpos, self._ctrl = self.data.qpos, self.data.ctrl
         self._left_wheel = model.joint("wheel_left").qposadr.item()
         self._right_wheel = model.joint("wheel_right").qposadr.item()
+        self._floor = model.geom("floor").id
         self.place(self.plan.start)
-        self._supports = self.data.ncon  # tyres and casters; they never leave the floor
 
     def place(self, pose: Pose) -> None:
         """Put the robot down at rest at a pose (x [m], y [m], heading [rad])."""
@@ -152,7 +152,8 @@ class Physics:
 
     def bumped(self) -> bool:
         """Return whether the robot touches a wall at the end of the step."""
-        return self.data.ncon > self._supports
+        # Their number does not tell: a tyre or caster may have left the floor.
+        return any(geom != self._floor for geom in self.data.contact.geom1.tolist())
 
     def wall_bearings(self) -> list[float]:
         """Return the direction of each touched wall, seen from the robot's heading [rad]."""

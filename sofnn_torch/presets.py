@@ -42,6 +42,7 @@ def _paper(agent: str, network: str) -> Config:
         rate_width=0.001,
         one_minus_gamma=True,
         variance_scaled=False,
+        value_limit=None,
         replays=0,
     )
     q_settings = QConfig(

@@ -136,9 +136,16 @@ class QLearning:
         return self._choose(x, self._firing(x))
 
     def step(
-        self, reward: float, observation: np.ndarray, terminated: bool
+        self, reward: float, observation: np.ndarray, terminated: bool, truncated: bool = False
     ) -> int | np.ndarray | None:
-        """Learn from the reward of the last action, then choose the next (None at the end)."""
+        """Learn from the reward of the last action, then choose the next (None at the end).
+
+        Args:
+            reward: reward of the last action.
+            observation: the state that it led to. Shape: (n,).
+            terminated: no state follows this one; its value is 0.
+            truncated: the trial ends here, but not the robot's way: the value of the state counts.
+        """
         if self.replays:
             self.memory.add([*self.features, reward, not terminated, *observation.tolist()])
         if terminated:
@@ -148,7 +155,12 @@ class QLearning:
         firing = self._firing(x)
         following = min(max(self.action_values(x, firing).tolist()), self.value_limit)
         self._learn(reward + self.gamma * following - self.value)
-        return self._choose(x, self._firing(x) if self.antecedents else firing)
+        if truncated:
+            return None
+        if self.antecedents:  # they have moved
+            with torch.no_grad():
+                firing = self.net.normalised_firing(self._inputs(x))
+        return self._choose(x, firing)
 
     def act(self, observation: np.ndarray, explore: float = 0) -> int | np.ndarray:
         """The greedy action, or one by roulette; learns nothing and adds no rule.
@@ -161,12 +173,15 @@ class QLearning:
         x = self._tensor(observation)
         with torch.no_grad():
             values = self.action_values(x, self.net.normalised_firing(self._inputs(x)))
-        segment = self._roulette(values.tolist(), explore) if explore else int(values.argmax())
-        return segment if self.actions == "three" else self._command(self.representatives[segment])
+        if explore:
+            return self._command(*self._draw(values.tolist(), explore))
+        segment = int(values.argmax())
+        return self._command(segment, self.representatives[segment])
 
     def strongest_rule(self, observation: np.ndarray) -> int:
         """The rule that fires most at the state (n,)."""
-        firing = self.net.normalised_firing(self._inputs(self._tensor(observation)))
+        with torch.no_grad():
+            firing = self.net.normalised_firing(self._inputs(self._tensor(observation)))
         return int(firing.argmax()) % self.net.n_rules
 
     def statistics(self) -> dict[str, float]:
@@ -226,9 +241,7 @@ class QLearning:
         """Draw an action (eq. 11) and add the gradient of its value to the traces."""
         net = self.net
         values = self.action_values(x, firing).tolist()
-        segment = self._roulette(values)
-        low, high = self.edges[segment]
-        inside = low + (high - low) * self.rng.random()
+        segment, inside = self._draw(values)
         scalar = self.representatives[segment] if self.actions == "three" else inside
         # The paper draws the action inside the segment also where the robot only has three.
         code = self._code(segment, inside if self.coding == "scalar" else scalar)
@@ -250,7 +263,7 @@ class QLearning:
         self._log["value"].append(self.value)
         self._log["greedy"].append(greedy)
         self._log["firing"].append(net.max_firing)
-        return segment if self.actions == "three" else self._command(scalar)
+        return self._command(segment, scalar)
 
     def _learn(self, error: float) -> None:
         """Equations 14 and 15 for the temporal-difference error."""
@@ -279,6 +292,12 @@ class QLearning:
         ball = self.rng.random() * wheel[-1]
         return next(j for j, edge in enumerate(wheel) if ball < edge)
 
+    def _draw(self, values: list[float], hotter: float = 1) -> tuple[int, float]:
+        """A segment by the roulette, and a number drawn uniformly inside it."""
+        segment = self._roulette(values, hotter)
+        low, high = self.edges[segment]
+        return segment, low + (high - low) * self.rng.random()
+
     def _code(self, segment: int, scalar: float) -> list[float]:
         """The action vector a of equation 9."""
         if self.coding == "onehot":
@@ -302,5 +321,5 @@ class QLearning:
     def _tensor(self, observation: np.ndarray) -> Tensor:
         return torch.from_numpy(observation).to(self.rates)
 
-    def _command(self, scalar: float) -> np.ndarray:
-        return np.array([scalar], np.float32)
+    def _command(self, segment: int, scalar: float) -> int | np.ndarray:
+        return segment if self.actions == "three" else np.array([scalar], np.float32)

@@ -114,7 +114,7 @@ def arithmetic(threads: int = 1) -> Iterator[None]:
     processors take many times as long. Nor does memory go back to the system after each batch: new
     pages cost as much as the arithmetic on them.
     """
-    flushed = bool(torch.tensor(1e-30) * 1e-10 == 0)
+    flushed, former = bool(torch.tensor(1e-30) * 1e-10 == 0), torch.get_num_threads()
     torch.set_flush_denormal(True)  # first: threads inherit it when they are made
     torch.set_num_threads(threads)
     torch.empty(LARGE_BLOCK, dtype=torch.uint8)  # freed at once; glibc keeps blocks of its size
@@ -122,6 +122,7 @@ def arithmetic(threads: int = 1) -> Iterator[None]:
         yield
     finally:
         torch.set_flush_denormal(flushed)
+        torch.set_num_threads(former)
 
 
 def begin(config: Config, options: RunOptions) -> Session:

@@ -67,6 +67,8 @@ class SGA:
         sigma_min: lower bound of sigma.
         sigma_max: upper bound of sigma.
         mean_limit: bound of the absolute value of mu.
+        value_limit: no following value counts for more than this, or less than minus this, in the
+            TD error; None for no bound.
         replays: batches of remembered decisions that the consequents learn from again at the
             beginning of each trial; 0 for none. Needs the learned baseline.
         memory: decisions that are remembered.
@@ -96,6 +98,7 @@ class SGA:
         sigma_min: float = 0.03,
         sigma_max: float = 1.0,
         mean_limit: float = 1.0,
+        value_limit: float | None = None,
         replays: int = 0,
         memory: int = 20_000,
         seed: int = 0,
@@ -119,6 +122,7 @@ class SGA:
         )
         self.variance_scaled, self.mean_limit = variance_scaled, mean_limit
         self.sigma_min, self.sigma_max = sigma_min, sigma_max
+        self.value_limit = math.inf if value_limit is None else value_limit
         self.rng = np.random.default_rng(seed)
         self.antecedents = rate_centre > 0 or rate_width > 0
         scale = 1 - gamma if one_minus_gamma else 1.0
@@ -148,9 +152,16 @@ class SGA:
         return self._choose(x, self.net.observe(x))
 
     def step(
-        self, reward: float, observation: np.ndarray, terminated: bool
+        self, reward: float, observation: np.ndarray, terminated: bool, truncated: bool = False
     ) -> int | np.ndarray | None:
-        """Learn from the reward of the last action, then choose the next (None at the end)."""
+        """Learn from the reward of the last action, then choose the next (None at the end).
+
+        Args:
+            reward: reward of the last action.
+            observation: the state that it led to. Shape: (n,).
+            terminated: no state follows this one; its value is 0.
+            truncated: the trial ends here, but not the robot's way: the value of the state counts.
+        """
         if self.replays:
             self.memory.add([*self.decision, reward, not terminated, *observation.tolist()])
         if terminated:
@@ -160,10 +171,10 @@ class SGA:
         firing = self.net.observe(x)
         error = reward - self.constant
         if self.learned:
-            following = self.net.conclude(firing).tolist()[-1]
-            error = reward + self.gamma * following - self.value
+            ahead, limit = self.net.conclude(firing).tolist()[-1], self.value_limit
+            error = reward + self.gamma * min(max(ahead, -limit), limit) - self.value
         self._learn(error)
-        return self._choose(x, firing)
+        return None if truncated else self._choose(x, firing)
 
     def act(self, observation: np.ndarray, explore: float = 0) -> int | np.ndarray:
         """The mean action, or a sampled one; learns nothing and adds no rule.
@@ -180,7 +191,8 @@ class SGA:
 
     def strongest_rule(self, observation: np.ndarray) -> int:
         """The rule that fires most at the state (n,)."""
-        return int(self.net.normalised_firing(self._tensor(observation)).argmax())
+        with torch.no_grad():
+            return int(self.net.normalised_firing(self._tensor(observation)).argmax())
 
     def statistics(self) -> dict[str, float]:
         """Means over the decisions since the last call (docs/metrics.md); starts afresh."""
@@ -266,6 +278,7 @@ class SGA:
             action, then, reward, goes_on = row
             firing = firing_at(x)
             ahead = firing_at(following) @ net.consequents[:, -1]
+            ahead.clamp_(-self.value_limit, self.value_limit)
             consequents = net.learnable(antecedents=False)
             mean, deviation, value = (consequents @ firing.T).split_with_sizes(self.parts)
             unexpected = surprise(action.T, mean, deviation)

@@ -182,9 +182,12 @@ class SOFNN(RuleTable):
 
         The one pass over the rules that a learning step needs: growth test and firing share the
         memberships. Counts the firing in ``usage``.
+
+        Raises:
+            ValueError: a frozen network has no rules.
         """
-        if self.n_rules == 0:
-            self.add_rule(x)
+        if self.n_rules == 0 and not self.grow(x):
+            raise ValueError("the network has no rules and may add none: build it with grid()")
         firing = self._grow(x).softmax(0)
         self._usage.add_(firing)
         return firing

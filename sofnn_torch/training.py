@@ -58,7 +58,7 @@ def play(
             observation, reward, terminated, truncated, info = env.step(action)
             over = terminated or truncated
             if learn:
-                action = agent.step(reward, observation, terminated)
+                action = agent.step(reward, observation, terminated, truncated)
             elif not over:
                 action = policy.act(observation)
             total += reward

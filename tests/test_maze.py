@@ -78,17 +78,19 @@ def test_20000_random_steps_stay_sound():
     env = KheperaMazeEnv(hold=10, max_steps=10**9)
     env.reset(seed=1)
     physics, supports = env.physics, env.physics.data.ncon
+    hidden = 0
     rng = np.random.default_rng(1)
     last, steps, bumps = physics.position(), 0, 0
 
     def check():
-        nonlocal last
+        nonlocal last, hidden
         x, y = physics.position()
         assert np.isfinite(physics.data.qpos).all() and np.isfinite(physics.data.qvel).all()
         assert physics.plan.clearance(x, y) > -0.0005
         assert math.dist((x, y), last) < 0.0060  # no kicks, no tunnelling
         assert physics.data.body("khepera").xmat[8] > 0.998  # upright
-        assert physics.data.ncon >= supports  # tyres and casters: a bump is one contact more
+        assert physics.bumped() == bool(physics.wall_bearings())
+        hidden += physics.bumped() and physics.data.ncon <= supports
         last = (x, y)
 
     env.on_simulator_step = check
@@ -100,6 +102,7 @@ def test_20000_random_steps_stay_sound():
             env.reset()
             last = physics.position()
     assert bumps > 500
+    assert hidden > 0  # bumps with no more contacts than at rest, as a wheel was off the floor
 
 
 def test_the_goal_ends_the_trial_and_pays_once_reached():

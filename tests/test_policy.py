@@ -33,7 +33,7 @@ def spy(agent, places):
     return explored
 
 
-def test_from_the_fourth_on_each_return_to_a_rule_doubles_the_chance_there():
+def test_each_decision_at_a_rule_after_the_fourth_doubles_the_chance_there():
     assert spy(contradiction(), [EAST] * 5 + [NORTH] + [EAST] * 2) == [0] * 4 + [1, 0, 3, 7]
     assert spy(contradiction(), [EAST] * 17)[-3:] == [1023] * 3
 
