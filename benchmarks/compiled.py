@@ -85,8 +85,8 @@ class Decision:
         usage.add_(firing)
         error = reward + agent.gamma * (consequents[-1] @ firing) - value
         mean, deviation, values = (consequents + error * agent.rates * traces).unbind()
-        mean = mean.clamp(-agent.mean_limit, agent.mean_limit)
-        deviation = deviation.clamp(agent.sigma_min, agent.sigma_max)
+        mean = mean.clamp(-agent.config.mean_limit, agent.config.mean_limit)
+        deviation = deviation.clamp(agent.config.sigma_min, agent.config.sigma_max)
         updated = torch.stack([mean, deviation, values])
 
         def objective(consequents: Tensor) -> tuple[Tensor, Tensor]:

@@ -1,7 +1,8 @@
 """What a run consists of: typed settings.
 
-Every field is a flag of ``train.py``; the string under a field is its help text. The presets are in
-`sofnn_torch.presets`, what is made from the settings in `sofnn_torch.factory`.
+Every field is a flag of ``train.py``; the string under a field is its help text. The settings of
+the learners are beside them in `sofnn_torch.sga` and `sofnn_torch.qlearning`, the presets in
+`sofnn_torch.presets`, and what is made from settings in `sofnn_torch.factory`.
 """
 
 import dataclasses
@@ -13,8 +14,8 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from sofnn_torch import validation
-from sofnn_torch.qlearning import Coding
-from sofnn_torch.sga import Actions
+from sofnn_torch.qlearning import QConfig
+from sofnn_torch.sga import SGAConfig
 from sofnn_torch.sofnn import Growth
 
 
@@ -41,98 +42,6 @@ class NetworkConfig:
     """Rules along the action of the fixed network, where the action is an antecedent."""
     max_rules: Annotated[int, tyro.conf.arg(aliases=["--max-rules"])] = 50_000
     """Hard limit; beyond it no rule is added and a warning is shown."""
-
-
-@dataclass(frozen=True)
-class SGAConfig:
-    """Section 3: stochastic gradient ascent."""
-
-    actions: Actions = "three"
-    """`three`: right turn, straight, left turn; `steer`: one continuous action that blends them;
-    `wheels`: two wheel speeds."""
-    gamma: float = 0.99
-    """Discount per decision."""
-    trace_decay: float = 0.8
-    """Lambda of the eligibility traces; 1 in the paper."""
-    baseline: Literal["constant", "value"] = "value"
-    """Reinforcement baseline b of eq. 7: the paper's constant, or a value learned by TD."""
-    constant: float = 0.0
-    """The constant baseline."""
-    rate_mean: float = 30.0
-    """Learning rate of the consequents mu."""
-    rate_deviation: float = 10.0
-    """Learning rate of the consequents sigma."""
-    rate_centre: float = 0.0
-    """Learning rate of the centres u; 0 leaves them where they were put."""
-    rate_width: float = 0.0
-    """Learning rate of the widths v; 0 leaves them as they are."""
-    rate_value: float = 1.0
-    """Learning rate of the value consequents (baseline `value`)."""
-    one_minus_gamma: bool = False
-    """Multiply the policy's learning rates by (1 - gamma), as eq. 8 prints."""
-    variance_scaled: bool = True
-    """Multiply eligibilities by sigma squared, which keeps steps bounded as sigma shrinks."""
-    initial_value: float = 0.65
-    """Value of an unknown state (baseline `value`); optimistic at the start of the maze."""
-    sigma_initial: float = 0.3
-    """Standard deviation of the first rule, and of new rules without interpolation."""
-    sigma_min: float = 0.1
-    """Lower bound of sigma."""
-    sigma_max: float = 1.0
-    """Upper bound of sigma."""
-    mean_limit: float = 1.0
-    """Bound of |mu|."""
-    value_limit: float | None = 2.0
-    """Bound of |value| of the following state in the TD error, twice the goal's reward; None for
-    no bound."""
-    replays: int = 100
-    """Batches of remembered decisions to learn from again at the beginning of each trial; 0 for
-    none. Needs baseline `value`."""
-    memory: int = 20_000
-    """Decisions that are remembered."""
-
-
-@dataclass(frozen=True)
-class QConfig:
-    """Section 4: Q-learning."""
-
-    actions: Literal["three", "steer"] = "three"
-    """`three`: right turn, straight, left turn; `steer`: one continuous action in J segments."""
-    coding: Coding = "onehot"
-    """Action vector of eq. 9: `scalar`, `wheels` (wheel speeds), `onehot`, or `antecedent` (the
-    action also enters the rules' antecedents: the paper's fuzzy net - a)."""
-    segments: int = 3
-    """Number J of segments of the action range."""
-    temperature: float = 0.05
-    """Temperature T of the Boltzmann roulette, eq. 11."""
-    gamma: float = 0.99
-    """Discount per decision."""
-    trace_decay: float = 0.8
-    """Lambda of the eligibility traces; 0 in the paper."""
-    trace_cut: bool = True
-    """Clear the traces at an action that is not greedy (Watkins)."""
-    trace_limit: float | None = 1.0
-    """Bound of the consequents' traces; None for no bound."""
-    value_limit: float | None = 100.0
-    """Bound of the value of the following state in the TD error, the goal's reward; None for no
-    bound."""
-    rate_state: float = 0.0
-    """Learning rate of c_x."""
-    rate_action: float = 1.0
-    """Learning rate of c_a."""
-    rate_constant: float = 0.0
-    """Learning rate of c."""
-    rate_centre: float = 0.0
-    """Learning rate of the centres u; 0 leaves them where they were put."""
-    rate_width: float = 0.0
-    """Learning rate of the widths v; 0 leaves them as they are."""
-    initial: float = 65.0
-    """Initial c of a rule, the value of an unknown state; optimistic at the start of the maze."""
-    replays: int = 100
-    """Batches of remembered decisions to learn from again at the beginning of each trial; 0 for
-    none."""
-    memory: int = 20_000
-    """Decisions that are remembered."""
 
 
 @dataclass(frozen=True)

@@ -173,14 +173,14 @@ def decide(agent: Agent, state: NDArray[np.float32]) -> Decision:
 
 def _actions(agent: Agent) -> list[str]:
     """Names of the actions that a learner chooses among; none if they are continuous."""
-    if agent.actions == "three":
+    if agent.config.actions == "three":
         return list(TURNS)
     return [] if isinstance(agent, SGA) else [f"{a:+.2f}" for a in agent.representatives]
 
 
 def _scale(agent: Agent) -> list[float]:
     """The same actions as turns from -1 to 1."""
-    return [-1.0, 0.0, 1.0] if agent.actions == "three" else agent.representatives
+    return [-1.0, 0.0, 1.0] if agent.config.actions == "three" else agent.representatives
 
 
 def bearing(heading: float, width: float | None = None) -> str:

@@ -53,9 +53,5 @@ def make_agent(config: Config) -> Agent:
             **common,
         )
     if config.agent == "q":
-        settings = dataclasses.asdict(config.q)
-        del settings["initial"]
-        return QLearning(network, 3, seed=config.seed, **settings)
-    settings = dataclasses.asdict(config.sga)
-    del settings["sigma_initial"], settings["initial_value"]
-    return SGA(network, seed=config.seed, **settings)
+        return QLearning(network, 3, config.q, config.seed)
+    return SGA(network, config.sga, config.seed)

@@ -14,6 +14,7 @@ consequents; as usual the target is held constant (semi-gradient).
 """
 
 import math
+from dataclasses import dataclass
 from itertools import accumulate, pairwise
 from typing import Literal
 
@@ -28,6 +29,49 @@ Coding = Literal["scalar", "wheels", "onehot", "antecedent"]
 TURN = 0.4  # wheel speed of a turn over that of going straight: 4 mm/s of 10 mm/s
 
 
+@dataclass(frozen=True)
+class QConfig:
+    """Section 4: Q-learning."""
+
+    actions: Literal["three", "steer"] = "three"
+    """`three`: right turn, straight, left turn; `steer`: one continuous action in J segments."""
+    coding: Coding = "onehot"
+    """Action vector of eq. 9: `scalar`, `wheels` (wheel speeds), `onehot`, or `antecedent` (the
+    action also enters the rules' antecedents: the paper's fuzzy net - a)."""
+    segments: int = 3
+    """Number J of segments of the action range."""
+    temperature: float = 0.05
+    """Temperature T of the Boltzmann roulette, eq. 11."""
+    gamma: float = 0.99
+    """Discount per decision."""
+    trace_decay: float = 0.8
+    """Lambda of the eligibility traces; 0 in the paper."""
+    trace_cut: bool = True
+    """Clear the traces at an action that is not greedy (Watkins)."""
+    trace_limit: float | None = 1.0
+    """Bound of the consequents' traces; None for no bound."""
+    value_limit: float | None = 100.0
+    """Bound of the value of the following state in the TD error, the goal's reward; None for no
+    bound."""
+    rate_state: float = 0.0
+    """Learning rate of c_x."""
+    rate_action: float = 1.0
+    """Learning rate of c_a."""
+    rate_constant: float = 0.0
+    """Learning rate of c."""
+    rate_centre: float = 0.0
+    """Learning rate of the centres u; 0 leaves them where they were put."""
+    rate_width: float = 0.0
+    """Learning rate of the widths v; 0 leaves them as they are."""
+    initial: float = 65.0
+    """Initial c of a rule, the value of an unknown state; optimistic at the start of the maze."""
+    replays: int = 100
+    """Batches of remembered decisions to learn from again at the beginning of each trial; 0 for
+    none."""
+    memory: int = 20_000
+    """Decisions that are remembered."""
+
+
 def code_length(coding: Coding, segments: int) -> int:
     """Length of the action vector in equation 9."""
     return {"scalar": 1, "wheels": 2, "onehot": segments, "antecedent": 1}[coding]
@@ -39,27 +83,7 @@ class QLearning:
     Args:
         net: network over the state, or over state and action with the coding ``antecedent``.
         n_states: length n of the state.
-        actions: what the robot takes. ``three``: the segment's number (J = 3: right turn,
-            straight, left turn). ``steer``: the continuous action.
-        coding: the action vector of equation 9. ``scalar``: the number itself; ``wheels``: the
-            (left, right) wheel speeds it stands for over the fastest; ``onehot``: the indicator
-            of its segment; ``antecedent``: the scalar, which also enters the antecedents
-            (the paper's fuzzy net - a).
-        segments: number J of segments.
-        temperature: T of equation 11.
-        gamma: discount per decision.
-        trace_decay: lambda; the paper has 0.
-        trace_cut: clear the traces when the chosen segment is not the greedy one (Watkins).
-        trace_limit: bound of the consequents' traces, None for no bound.
-        value_limit: no following value in equations 12 and 13 counts for more; None for no bound.
-        rate_state: learning rate of c_x.
-        rate_action: learning rate of c_a.
-        rate_constant: learning rate of c.
-        rate_centre: learning rate of the centres.
-        rate_width: learning rate of the widths.
-        replays: batches of remembered decisions that the consequents learn from again at the
-            beginning of each trial; 0 for none.
-        memory: decisions that are remembered.
+        config: the settings; their initial value is that of the network.
         seed: seed of the roulette and of the action inside a segment.
 
     Raises:
@@ -67,29 +91,8 @@ class QLearning:
             range.
     """
 
-    def __init__(
-        self,
-        net: SOFNN,
-        n_states: int,
-        *,
-        actions: Literal["three", "steer"] = "three",
-        coding: Coding = "onehot",
-        segments: int = 3,
-        temperature: float = 0.05,
-        gamma: float = 0.99,
-        trace_decay: float = 0.8,
-        trace_cut: bool = True,
-        trace_limit: float | None = 1.0,
-        value_limit: float | None = None,
-        rate_state: float = 0.0,
-        rate_action: float = 1.0,
-        rate_constant: float = 0.0,
-        rate_centre: float = 0.0,
-        rate_width: float = 0.0,
-        replays: int = 0,
-        memory: int = 20_000,
-        seed: int = 0,
-    ):
+    def __init__(self, net: SOFNN, n_states: int, config: QConfig, seed: int = 0):
+        coding, segments = config.coding, config.segments
         length = code_length(coding, segments)
         inputs = n_states + (coding == "antecedent")
         if (net.n_inputs, net.n_outputs) != (inputs, n_states + length + 1):
@@ -97,30 +100,33 @@ class QLearning:
                 f"coding {coding} needs {inputs} inputs and {n_states + length + 1} outputs, "
                 f"the network has {net.n_inputs} and {net.n_outputs}"
             )
-        if actions == "three" and segments != 3:
+        if config.actions == "three" and segments != 3:
             raise ValueError(f"the three actions need 3 segments, got {segments}")
-        if not temperature > 0:
-            raise ValueError(f"the temperature must be positive, got {temperature}")
-        self.net, self.n, self.actions, self.coding = net, n_states, actions, coding
-        self.segments, self.temperature, self.gamma = segments, temperature, gamma
-        self.decay, self.trace_cut, self.trace_limit = gamma * trace_decay, trace_cut, trace_limit
-        self.value_limit = math.inf if value_limit is None else value_limit
+        if not config.temperature > 0:
+            raise ValueError(f"the temperature must be positive, got {config.temperature}")
+        self.net, self.n, self.config = net, n_states, config
+        self.coding, self.segments = coding, segments
+        self.gamma, self.decay = config.gamma, config.gamma * config.trace_decay
+        self.value_limit = math.inf if config.value_limit is None else config.value_limit
         self.rng = np.random.default_rng(seed)
-        self.antecedents = rate_centre > 0 or rate_width > 0
-        rates = [rate_state] * n_states + [rate_action] * length + [rate_constant]
+        self.antecedents = config.rate_centre > 0 or config.rate_width > 0
+        rates = [config.rate_state] * n_states + [config.rate_action] * length
+        rates += [config.rate_constant]
         if self.antecedents:
-            rates = [rate_centre] * net.n_inputs + [rate_width] * net.n_inputs + rates
+            n = net.n_inputs
+            rates = [config.rate_centre] * n + [config.rate_width] * n + rates
         self.rates = net.default_width.new_tensor(rates)[:, None]
-        self.replays, self.replay_rates = replays, self.rates[-net.n_outputs :]
-        if replays:
+        self.replay_rates = self.rates[-net.n_outputs :]
+        if config.replays:
             fields = {"features": net.n_outputs, "reward": 0, "goes_on": 0, "following": n_states}
-            self.memory = ReplayMemory(fields, memory, net.default_width.cpu().numpy().dtype)
+            dtype = net.default_width.cpu().numpy().dtype
+            self.memory = ReplayMemory(fields, config.memory, dtype)
         self.features: list[float] = []  # (x, a, 1) of the last decision
         ends = [-1 + 2 * j / segments for j in range(segments + 1)]
         self.edges = list(pairwise(ends))
         middles = [(low + high) / 2 for low, high in self.edges]
         # The three actions are the ends and the middle of the steering range themselves.
-        self.representatives = [-1.0, 0.0, 1.0] if actions == "three" else middles
+        self.representatives = [-1.0, 0.0, 1.0] if config.actions == "three" else middles
         codes = [self._code(j, a) for j, a in enumerate(self.representatives)]
         self.codes = self.rates.new_tensor(codes)  # (J, length)
         self.tails = torch.cat([self.codes, self.codes.new_ones(segments, 1)], 1)
@@ -130,7 +136,7 @@ class QLearning:
     def start(self, observation: np.ndarray) -> int | np.ndarray:
         """Begin a trial at the observation (n,): clear the traces, choose the first action."""
         self.net.traces.zero_()
-        if self.replays and len(self.memory):
+        if self.config.replays and len(self.memory):
             self._replay()
         x = self._tensor(observation)
         return self._choose(x, self._firing(x))
@@ -146,7 +152,7 @@ class QLearning:
             terminated: no state follows this one; its value is 0.
             truncated: the trial ends here, but not the robot's way: the value of the state counts.
         """
-        if self.replays:
+        if self.config.replays:
             self.memory.add([*self.features, reward, not terminated, *observation.tolist()])
         if terminated:
             self._learn(reward - self.value)
@@ -201,14 +207,14 @@ class QLearning:
         """Everything that the future depends on, as tensors, numbers and text."""
         rng = self.rng.bit_generator.state
         state = {"net": self.net.state_dict(), "rng": rng, "value": self.value}
-        return state | ({"memory": self.memory.state_dict()} if self.replays else {})
+        return state | ({"memory": self.memory.state_dict()} if self.config.replays else {})
 
     def load_state_dict(self, state: dict) -> None:
         """Counterpart of `state_dict`; a fresh learner takes the size of the stored network."""
         self.net.load_state_dict(state["net"])
         self.rng.bit_generator.state = state["rng"]
         self.value = state["value"]
-        if self.replays:
+        if self.config.replays:
             self.memory.load_state_dict(state["memory"])
 
     def action_values(self, x: Tensor, firing: Tensor) -> Tensor:
@@ -242,7 +248,7 @@ class QLearning:
         net = self.net
         values = self.action_values(x, firing).tolist()
         segment, inside = self._draw(values)
-        scalar = self.representatives[segment] if self.actions == "three" else inside
+        scalar = self.representatives[segment] if self.config.actions == "three" else inside
         # The paper draws the action inside the segment also where the robot only has three.
         code = self._code(segment, inside if self.coding == "scalar" else scalar)
         self.features = [*x.tolist(), *code, 1.0]
@@ -257,9 +263,9 @@ class QLearning:
         outputs = consequents @ firing
         self.value = (features @ outputs.detach()).item()
         greedy = values[segment] == max(values)
-        decay = self.decay if greedy or not self.trace_cut else 0.0
+        decay = self.decay if greedy or not self.config.trace_cut else 0.0
         gradient = torch.autograd.grad(outputs, parameters, features)[0]  # of features . outputs
-        net.accumulate(gradient, decay, self.trace_limit)
+        net.accumulate(gradient, decay, self.config.trace_limit)
         self._log["value"].append(self.value)
         self._log["greedy"].append(greedy)
         self._log["firing"].append(net.max_firing)
@@ -273,7 +279,7 @@ class QLearning:
     def _replay(self) -> None:
         """Equations 12-15 for batches of remembered decisions; the antecedents stay."""
         net, firing_at = self.net, self.net.firing_function()
-        seen = self.memory.sample(self.replays, self.rng, self.rates)
+        seen = self.memory.sample(self.config.replays, self.rng, self.rates)
         here = net.features(seen["features"][..., : net.n_inputs])
         there = net.features(self._inputs(seen["following"]))
         for x, ahead, *row in zip(here, there, *seen.values(), strict=True):
@@ -287,7 +293,7 @@ class QLearning:
 
     def _roulette(self, values: list[float], hotter: float = 1) -> int:
         """A segment drawn with the probabilities of equation 11."""
-        best, temperature = max(values), self.temperature * hotter
+        best, temperature = max(values), self.config.temperature * hotter
         wheel = list(accumulate(math.exp((v - best) / temperature) for v in values))
         ball = self.rng.random() * wheel[-1]
         return next(j for j, edge in enumerate(wheel) if ball < edge)
@@ -322,4 +328,4 @@ class QLearning:
         return torch.from_numpy(observation).to(self.rates)
 
     def _command(self, segment: int, scalar: float) -> int | np.ndarray:
-        return segment if self.actions == "three" else np.array([scalar], np.float32)
+        return segment if self.config.actions == "three" else np.array([scalar], np.float32)

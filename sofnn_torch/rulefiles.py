@@ -84,15 +84,17 @@ def schema(agent: Agent) -> Schema:
     low[n : 2 * n] = net.min_width
     if isinstance(agent, SGA):
         mean, deviation = slice(2 * n, 2 * n + agent.m), slice(2 * n + agent.m, 2 * n + 2 * agent.m)
-        low[mean], high[mean] = -agent.mean_limit, agent.mean_limit
-        low[deviation], high[deviation] = agent.sigma_min, agent.sigma_max
+        low[mean], high[mean] = -agent.config.mean_limit, agent.config.mean_limit
+        low[deviation], high[deviation] = agent.config.sigma_min, agent.config.sigma_max
         sides = ("_left", "_right") if agent.m == 2 else ("",)
         outputs = [f"{name}{side}" for name in ("mu", "sigma") for side in sides]
         outputs += ["value"] * agent.learned
     else:
         segments = [f"c_segment_{j + 1}" for j in range(agent.segments)]
+        if agent.config.actions == "three":
+            segments = ["c_right", "c_straight", "c_left"]
         actions = {
-            "onehot": ["c_right", "c_straight", "c_left"] if agent.actions == "three" else segments,
+            "onehot": segments,
             "wheels": ["c_wheel_left", "c_wheel_right"],
         }.get(agent.coding, ["c_action"])
         outputs = [*(f"c_{name}" for name, _ in INPUTS[: agent.n]), *actions, "c"]

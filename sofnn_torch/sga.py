@@ -15,6 +15,7 @@ constant, as in the paper, or the change of a value V learned on the same rules 
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -26,6 +27,55 @@ from sofnn_torch.sofnn import SOFNN
 
 Actions = Literal["three", "steer", "wheels"]
 RIGHT, STRAIGHT, LEFT = 0, 1, 2
+
+
+@dataclass(frozen=True)
+class SGAConfig:
+    """Section 3: stochastic gradient ascent."""
+
+    actions: Actions = "three"
+    """`three`: right turn, straight, left turn; `steer`: one continuous action that blends them;
+    `wheels`: two wheel speeds."""
+    gamma: float = 0.99
+    """Discount per decision."""
+    trace_decay: float = 0.8
+    """Lambda of the eligibility traces; 1 in the paper."""
+    baseline: Literal["constant", "value"] = "value"
+    """Reinforcement baseline b of eq. 7: the paper's constant, or a value learned by TD."""
+    constant: float = 0.0
+    """The constant baseline."""
+    rate_mean: float = 30.0
+    """Learning rate of the consequents mu."""
+    rate_deviation: float = 10.0
+    """Learning rate of the consequents sigma."""
+    rate_centre: float = 0.0
+    """Learning rate of the centres u; 0 leaves them where they were put."""
+    rate_width: float = 0.0
+    """Learning rate of the widths v; 0 leaves them as they are."""
+    rate_value: float = 1.0
+    """Learning rate of the value consequents (baseline `value`)."""
+    one_minus_gamma: bool = False
+    """Multiply the policy's learning rates by (1 - gamma), as eq. 8 prints."""
+    variance_scaled: bool = True
+    """Multiply eligibilities by sigma squared, which keeps steps bounded as sigma shrinks."""
+    initial_value: float = 0.65
+    """Value of an unknown state (baseline `value`); optimistic at the start of the maze."""
+    sigma_initial: float = 0.3
+    """Standard deviation of the first rule, and of new rules without interpolation."""
+    sigma_min: float = 0.1
+    """Lower bound of sigma."""
+    sigma_max: float = 1.0
+    """Upper bound of sigma."""
+    mean_limit: float = 1.0
+    """Bound of |mu|."""
+    value_limit: float | None = 2.0
+    """Bound of |value| of the following state in the TD error, twice the goal's reward; None for
+    no bound."""
+    replays: int = 100
+    """Batches of remembered decisions to learn from again at the beginning of each trial; 0 for
+    none. Needs baseline `value`."""
+    memory: int = 20_000
+    """Decisions that are remembered."""
 
 
 def surprise(action: Tensor, mean: Tensor, deviation: Tensor) -> Tensor:
@@ -49,29 +99,7 @@ class SGA:
 
     Args:
         net: network with ``2 m`` outputs, ``2 m + 1`` with a learned baseline.
-        actions: what the robot takes. ``three``: the scalar a is cut at -1/3 and 1/3 into right
-            turn, straight, left turn. ``steer``, ``wheels``: the vector a itself, clipped by the
-            environment to [-1, 1].
-        gamma: discount per decision.
-        trace_decay: lambda; the paper's equation 6 has 1.
-        baseline: ``constant`` is the paper's b, ``value`` learns it.
-        constant: the constant b.
-        rate_mean: learning rate of the mu consequents.
-        rate_deviation: learning rate of the sigma consequents.
-        rate_centre: learning rate of the centres u.
-        rate_width: learning rate of the widths v.
-        rate_value: learning rate of the value consequents.
-        one_minus_gamma: multiply the policy's rates by (1 - gamma) as equation 8 prints.
-        variance_scaled: multiply the eligibility of each action by its sigma^2 (Williams 1992),
-            so that steps do not explode as sigma shrinks.
-        sigma_min: lower bound of sigma.
-        sigma_max: upper bound of sigma.
-        mean_limit: bound of the absolute value of mu.
-        value_limit: no following value counts for more than this, or less than minus this, in the
-            TD error; None for no bound.
-        replays: batches of remembered decisions that the consequents learn from again at the
-            beginning of each trial; 0 for none. Needs the learned baseline.
-        memory: decisions that are remembered.
+        config: the settings; their initial values are those of the network.
         seed: seed of the action sampling.
 
     Raises:
@@ -79,66 +107,38 @@ class SGA:
             replays lack the learned baseline.
     """
 
-    def __init__(
-        self,
-        net: SOFNN,
-        *,
-        actions: Actions = "three",
-        gamma: float = 0.99,
-        trace_decay: float = 0.8,
-        baseline: Literal["constant", "value"] = "value",
-        constant: float = 0.0,
-        rate_mean: float = 30.0,
-        rate_deviation: float = 10.0,
-        rate_centre: float = 0.0,
-        rate_width: float = 0.0,
-        rate_value: float = 1.0,
-        one_minus_gamma: bool = False,
-        variance_scaled: bool = True,
-        sigma_min: float = 0.03,
-        sigma_max: float = 1.0,
-        mean_limit: float = 1.0,
-        value_limit: float | None = None,
-        replays: int = 0,
-        memory: int = 20_000,
-        seed: int = 0,
-    ):
-        m = n_actions(actions)
-        learned = baseline == "value"
+    def __init__(self, net: SOFNN, config: SGAConfig, seed: int = 0):
+        m, learned = n_actions(config.actions), config.baseline == "value"
         if net.n_outputs != 2 * m + learned:
             raise ValueError(
                 f"SGA needs {2 * m + learned} outputs, the network has {net.n_outputs}"
             )
-        if not 0 < sigma_min <= sigma_max:
-            raise ValueError(f"need 0 < sigma_min <= sigma_max, got {sigma_min} and {sigma_max}")
-        if replays and not learned:
+        if not 0 < config.sigma_min <= config.sigma_max:
+            bounds = f"{config.sigma_min} and {config.sigma_max}"
+            raise ValueError(f"need 0 < sigma_min <= sigma_max, got {bounds}")
+        if config.replays and not learned:
             raise ValueError("replays need the learned baseline: without it set replays to 0")
-        self.net, self.actions, self.m = net, actions, m
-        self.gamma, self.decay, self.learned, self.constant = (
-            gamma,
-            gamma * trace_decay,
-            learned,
-            constant,
-        )
-        self.variance_scaled, self.mean_limit = variance_scaled, mean_limit
-        self.sigma_min, self.sigma_max = sigma_min, sigma_max
-        self.value_limit = math.inf if value_limit is None else value_limit
+        self.net, self.config, self.m, self.learned = net, config, m, learned
+        self.gamma, self.decay = config.gamma, config.gamma * config.trace_decay
+        self.value_limit = math.inf if config.value_limit is None else config.value_limit
         self.rng = np.random.default_rng(seed)
-        self.antecedents = rate_centre > 0 or rate_width > 0
-        scale = 1 - gamma if one_minus_gamma else 1.0
-        rates = [rate_mean * scale] * m + [rate_deviation * scale] * m + [rate_value] * learned
+        self.antecedents = config.rate_centre > 0 or config.rate_width > 0
+        scale = 1 - config.gamma if config.one_minus_gamma else 1.0
+        rates = [config.rate_mean * scale] * m + [config.rate_deviation * scale] * m
+        rates += [config.rate_value] * learned
         if self.antecedents:
             n = net.n_inputs
-            rates = [rate_centre * scale] * n + [rate_width * scale] * n + rates
+            rates = [config.rate_centre * scale] * n + [config.rate_width * scale] * n + rates
         self.rates = net.default_width.new_tensor(rates)[:, None]
         self.one = self.rates.new_ones(1)
         self.parts = (m, m, 1) if learned else (m, m)  # outputs mu, sigma and value
-        self.replays, self.replay_rates = replays, self.rates[-net.n_outputs :]
-        if replays:
+        self.replay_rates = self.rates[-net.n_outputs :]
+        if config.replays:
             n = net.n_inputs
             fields = {"state": n, "action": m, "surprise": 0}
             fields |= {"reward": 0, "goes_on": 0, "following": n}
-            self.memory = ReplayMemory(fields, memory, net.default_width.cpu().numpy().dtype)
+            dtype = net.default_width.cpu().numpy().dtype
+            self.memory = ReplayMemory(fields, config.memory, dtype)
         self.decision: list[float] = []  # state, action and its surprise
         self.value = 0.0
         self._log = {"mu": [], "sigma": [], "error": [], "firing": []}
@@ -146,7 +146,7 @@ class SGA:
     def start(self, observation: np.ndarray) -> int | np.ndarray:
         """Begin a trial at the observation (n,): clear the traces, choose the first action."""
         self.net.traces.zero_()
-        if self.replays and len(self.memory):
+        if self.config.replays and len(self.memory):
             self._replay()
         x = self._tensor(observation)
         return self._choose(x, self.net.observe(x))
@@ -162,14 +162,14 @@ class SGA:
             terminated: no state follows this one; its value is 0.
             truncated: the trial ends here, but not the robot's way: the value of the state counts.
         """
-        if self.replays:
+        if self.config.replays:
             self.memory.add([*self.decision, reward, not terminated, *observation.tolist()])
         if terminated:
-            self._learn(reward - self.value if self.learned else reward - self.constant)
+            self._learn(reward - self.value if self.learned else reward - self.config.constant)
             return None
         x = self._tensor(observation)
         firing = self.net.observe(x)
-        error = reward - self.constant
+        error = reward - self.config.constant
         if self.learned:
             ahead, limit = self.net.conclude(firing).tolist()[-1], self.value_limit
             error = reward + self.gamma * min(max(ahead, -limit), limit) - self.value
@@ -213,14 +213,14 @@ class SGA:
         """Everything that the future depends on, as tensors, numbers and text."""
         rng = self.rng.bit_generator.state
         state = {"net": self.net.state_dict(), "rng": rng, "value": self.value}
-        return state | ({"memory": self.memory.state_dict()} if self.replays else {})
+        return state | ({"memory": self.memory.state_dict()} if self.config.replays else {})
 
     def load_state_dict(self, state: dict) -> None:
         """Counterpart of `state_dict`; a fresh learner takes the size of the stored network."""
         self.net.load_state_dict(state["net"])
         self.rng.bit_generator.state = state["rng"]
         self.value = state["value"]
-        if self.replays:
+        if self.config.replays:
             self.memory.load_state_dict(state["memory"])
 
     def _choose(self, x: Tensor, firing: Tensor) -> int | np.ndarray:
@@ -235,7 +235,7 @@ class SGA:
         mu, sigma = numbers[:m], numbers[m : 2 * m]
         noise = [self.rng.standard_normal() for _ in range(m)]
         action = [u + s * z for u, s, z in zip(mu, sigma, noise, strict=True)]
-        scale = [-s * s for s in sigma] if self.variance_scaled else [-1.0] * m
+        scale = [-s * s for s in sigma] if self.config.variance_scaled else [-1.0] * m
         taken, weights = x.new_tensor([action, scale])
         mean, deviation, *value = outputs.split_with_sizes(self.parts)
         unexpected = surprise(taken, mean, deviation)
@@ -247,7 +247,7 @@ class SGA:
         else:
             gradient = torch.autograd.grad(unexpected, parameters, weights)
         net.accumulate(gradient[0], self.decay)
-        if self.replays:
+        if self.config.replays:
             unlikely = sum(math.log(s) + z * z / 2 for s, z in zip(sigma, noise, strict=True))
             self.decision = [*x.tolist(), *action, unlikely]
         self._log["mu"] += mu
@@ -262,8 +262,8 @@ class SGA:
         self._bound()
 
     def _bound(self) -> None:
-        self.net.clamp_consequents(0, self.m, -self.mean_limit, self.mean_limit)
-        self.net.clamp_consequents(self.m, 2 * self.m, self.sigma_min, self.sigma_max)
+        self.net.clamp_consequents(0, self.m, -self.config.mean_limit, self.config.mean_limit)
+        self.net.clamp_consequents(self.m, 2 * self.m, self.config.sigma_min, self.config.sigma_max)
 
     def _replay(self) -> None:
         """Equations 5-8 without traces for batches of remembered decisions; the antecedents stay.
@@ -272,7 +272,7 @@ class SGA:
         Networks 22, 2009; Espeholt et al., ICML 2018).
         """
         net, firing_at = self.net, self.net.firing_function()
-        seen = self.memory.sample(self.replays, self.rng, self.rates)
+        seen = self.memory.sample(self.config.replays, self.rng, self.rates)
         here, there = net.features(seen.pop("state")), net.features(seen.pop("following"))
         for x, following, *row in zip(here, there, *seen.values(), strict=True):
             action, then, reward, goes_on = row
@@ -285,7 +285,7 @@ class SGA:
             ratio = (then - unexpected.detach().sum(0)).exp_().clamp_(max=1.0)
             error = reward + self.gamma * goes_on * ahead - value.detach()
             weights, spread = ratio * error, deviation.detach()
-            scale = spread.square() if self.variance_scaled else torch.ones_like(spread)
+            scale = spread.square() if self.config.variance_scaled else torch.ones_like(spread)
             (gradient,) = torch.autograd.grad(
                 (value, unexpected), consequents, (weights, -weights * scale)
             )
@@ -296,6 +296,6 @@ class SGA:
         return torch.from_numpy(observation).to(self.rates)
 
     def _command(self, action: Sequence[float] | np.ndarray) -> int | np.ndarray:
-        if self.actions != "three":
+        if self.config.actions != "three":
             return np.clip(action, -1, 1).astype(np.float32)
         return RIGHT if action[0] < -1 / 3 else LEFT if action[0] > 1 / 3 else STRAIGHT

@@ -57,7 +57,7 @@ def _ask(agent: "Agent", states: torch.Tensor) -> tuple[torch.Tensor, torch.Tens
             left, right = action.T
             return (left + right) / 2, ((right - left) / 0.8).clamp(-1, 1), value
         action = action[:, 0]
-        if agent.actions == "three":
+        if agent.config.actions == "three":
             action = (action > 1 / 3).to(action) - (action < -1 / 3).to(action)
     return 1 - action.abs(), action, value
 

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from sofnn_torch.qlearning import QLearning, code_length
+from sofnn_torch.qlearning import QConfig, QLearning, code_length
 from sofnn_torch.sofnn import SOFNN
 
 N, TAU = 3, 2 * math.pi
@@ -40,7 +40,8 @@ def learner(coding="onehot", rules=25, seed=0, segments=3, n_outputs=None, **set
         centre = torch.rand(inputs).double() * 2 - 1
         centre[2] *= math.pi
         net.add_rule(centre, 0.2 + torch.rand(inputs).double(), torch.randn(outputs).double())
-    return QLearning(net, N, coding=coding, segments=segments, seed=seed, **settings)
+    settings = {"value_limit": None, "replays": 0} | settings
+    return QLearning(net, N, QConfig(coding=coding, segments=segments, **settings), seed)
 
 
 def closed_form(net, x, features):
@@ -59,7 +60,9 @@ def closed_form(net, x, features):
 
 def chosen(agent, command, x):
     """Features (x, a, 1) and network input of the action that was taken, from the command."""
-    scalar = agent.representatives[command] if agent.actions == "three" else float(command[0])
+    scalar = (
+        agent.representatives[command] if agent.config.actions == "three" else float(command[0])
+    )
     if agent.coding == "onehot":
         code = [float(j == command) for j in range(agent.segments)]
     elif agent.coding == "wheels":

@@ -347,7 +347,7 @@ def test_the_rules_at_a_state_add_up_to_what_the_learner_says(trained, variant):
         assert decision.outputs == pytest.approx(expected.numpy(), rel=1e-4, abs=1e-5)
         assert decision.shares.sum(0) == pytest.approx(1.0, abs=1e-5)
         action = agent.act(state)
-        if agent.actions == "three":
+        if agent.config.actions == "three":
             assert decision.action == explain.TURNS[action]
         else:
             assert f"{action[-1]:.2f}".replace("-0.00", "0.00") in decision.action

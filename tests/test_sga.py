@@ -1,5 +1,6 @@
 """SGA against the closed forms of its gradients and hand-computed updates (eqs 4-8)."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -8,7 +9,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sofnn_torch.sga import LEFT, RIGHT, SGA, STRAIGHT, log_likelihood
+from sofnn_torch.sga import LEFT, RIGHT, SGA, STRAIGHT, SGAConfig, log_likelihood
 from sofnn_torch.sofnn import SOFNN
 
 N, TAU = 3, 2 * math.pi
@@ -34,7 +35,8 @@ def learner(m=1, rules=30, seed=0, baseline="value", n_outputs=None, **settings)
         centre[2] *= math.pi
         net.add_rule(centre.double(), width.double(), consequents.double())
     actions = "wheels" if m == 2 else "steer"
-    return SGA(net, actions=actions, baseline=baseline, seed=seed, **settings)
+    settings = {"sigma_min": 0.03, "value_limit": None, "replays": 0} | settings
+    return SGA(net, SGAConfig(actions=actions, baseline=baseline, **settings), seed)
 
 
 def closed_form(net, x, action, m):
@@ -171,7 +173,7 @@ def test_log_likelihood_is_the_normal_density():
 )
 def test_the_scalar_is_cut_into_three_actions(mean, command):
     agent = learner(rules=1)
-    agent.actions = "three"
+    agent.config = dataclasses.replace(agent.config, actions="three")
     agent.net.blocks[0].data[-3, 0] = mean
     assert agent.act(np.zeros(3)) == command
 
