@@ -95,7 +95,8 @@ def maze_plan(plan: "MazePlan", ax: Axes, labels: bool = True) -> None:
         _spot(ax, centre, plan.subgoal_radius, "0.35", ":", f"sub-goal {number}" if labels else "")
     _spot(ax, plan.goal, plan.goal_radius, "#006B4E", "-", "goal" if labels else "")
     x, y, heading = plan.start
-    _spot(ax, (x, y), plan.robot_radius, BLACK, "-", "start" if labels else "")
+    _spot(ax, (x, y), plan.start_radius, "0.6", "-", "start" if labels else "")
+    ax.add_patch(Circle((x, y), plan.robot_radius, fill=False, edgecolor=BLACK, zorder=3))
     tip = plan.robot_radius * np.array([math.cos(heading), math.sin(heading)])
     ax.plot([x, x + tip[0]], [y, y + tip[1]], color=BLACK, linewidth=1.2, zorder=4)
     x0, y0, x1, y1 = bounds(plan)
@@ -132,7 +133,7 @@ def _note(ax: Axes, text: str, at: tuple[float, float], shift: float, **style: A
 @styled
 def trajectory(plan: "MazePlan", path: "Trajectory", ax: Axes) -> None:
     """The true path with its estimate, and a heading tick at every decision."""
-    maze_plan(plan, ax)
+    maze_plan(plan, ax, labels=False)  # the path would run through them
     ax.plot(*path.true[:, :2].T, color=BLUE, linewidth=1.4, zorder=4, label="true")
     ax.plot(
         *path.estimated[:, :2].T,
