@@ -3,7 +3,7 @@
     python benchmarks/soak.py --out docs/images
 
 trains in the ordinary way, samples the process's memory, stops itself as Ctrl-C would, prints a
-table, and writes soak.json and soak.png.
+table, and writes soak-<agent>.json and soak-<agent>.png.
 """
 
 import json
@@ -102,11 +102,11 @@ def report(samples: list[dict[str, float]], log: float, soak: Soak) -> None:
     data = {"directory_mebibytes": log, "samples": samples}
     (soak.out / f"soak-{soak.agent}.json").write_text(json.dumps(data))
     figure, (ax,) = figures.canvas(width=5, height=3)
-    ax.plot(columns["steps"] / 1e6, columns["mebibytes"], label="memory of the process")
-    ax.set(xlabel="simulator steps [million]", ylabel="MiB", ylim=(0, None))
+    ax.plot(columns["steps"] / 1e6, columns["mebibytes"], color=figures.BLUE)
+    ax.set(xlabel="simulator steps [million]", ylabel="process memory [MiB] (blue)", ylim=(0, None))
     twin = ax.twinx()
-    twin.plot(columns["steps"] / 1e6, columns["rules"], color="0.6")
-    twin.set(ylabel="rules (grey)", ylim=(0, None))
+    twin.plot(columns["steps"] / 1e6, columns["rules"], "--", color="0.6")
+    twin.set(ylabel="rules (grey, dashed)", ylim=(0, None))
     (soak.out / f"soak-{soak.agent}.png").write_bytes(figures.png(figure))
 
 

@@ -5,7 +5,9 @@
     python -m sofnn_torch.evaluate RUN --video run.mp4 --viewer
 
 By default the robot takes the mean action (SGA) or the greedy one (Q-learning); with --explore it
-samples its learned stochastic policy. Nothing is learned and the run directory is not changed.
+samples its learned stochastic policy. From its fourth return to the same rule in a trial on, the
+policy gains chance at that rule, so that it leaves circles. Nothing is learned and the run
+directory is not changed.
 """
 
 import dataclasses

@@ -20,7 +20,13 @@ from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 from matplotlib.patheffects import withStroke
-from matplotlib.ticker import LogLocator, MultipleLocator, NullFormatter, StrMethodFormatter
+from matplotlib.ticker import (
+    LogLocator,
+    MaxNLocator,
+    MultipleLocator,
+    NullFormatter,
+    StrMethodFormatter,
+)
 from numpy.typing import NDArray
 
 from sofnn_torch.survey import survey
@@ -89,7 +95,8 @@ def maze_plan(plan: "MazePlan", ax: Axes, labels: bool = True) -> None:
         _spot(ax, centre, plan.subgoal_radius, "0.35", ":", f"sub-goal {number}" if labels else "")
     _spot(ax, plan.goal, plan.goal_radius, "#006B4E", "-", "goal" if labels else "")
     x, y, heading = plan.start
-    _spot(ax, (x, y), plan.robot_radius, BLACK, "-", "start" if labels else "")
+    _spot(ax, (x, y), plan.start_radius, "0.6", "-", "start" if labels else "")
+    ax.add_patch(Circle((x, y), plan.robot_radius, fill=False, edgecolor=BLACK, zorder=3))
     tip = plan.robot_radius * np.array([math.cos(heading), math.sin(heading)])
     ax.plot([x, x + tip[0]], [y, y + tip[1]], color=BLACK, linewidth=1.2, zorder=4)
     x0, y0, x1, y1 = bounds(plan)
@@ -126,7 +133,7 @@ def _note(ax: Axes, text: str, at: tuple[float, float], shift: float, **style: A
 @styled
 def trajectory(plan: "MazePlan", path: "Trajectory", ax: Axes) -> None:
     """The true path with its estimate, and a heading tick at every decision."""
-    maze_plan(plan, ax)
+    maze_plan(plan, ax, labels=False)  # the path would run through them
     ax.plot(*path.true[:, :2].T, color=BLUE, linewidth=1.4, zorder=4, label="true")
     ax.plot(
         *path.estimated[:, :2].T,
@@ -352,7 +359,7 @@ def read_column(path: Path, column: str) -> NDArray[np.float64]:
     return np.array([float(words.get(row[column], row[column])) for row in rows])
 
 
-def logarithmic(ax: Axes, subs: Sequence[float] = (1, 2, 5)) -> None:
+def logarithmic(ax: Axes, subs: Sequence[float] = (1, 2, 3, 5)) -> None:
     """A logarithmic vertical axis with plain numbers at some multiples of powers of ten."""
     ax.set_yscale("log")
     ax.yaxis.set_major_locator(LogLocator(subs=subs))
@@ -372,7 +379,7 @@ def learning_curves(
 
     Args:
         arms: name of each arm and the ``trials.csv`` of its seeds, or their columns (trials,);
-            the shortest ends the curve.
+            the shortest ends the median.
         ax: where to draw.
         column: column of the file.
         label: label of the vertical axis, with its unit.
@@ -387,8 +394,9 @@ def learning_curves(
         curves = [run if isinstance(run, np.ndarray) else read_column(run, column) for run in runs]
         length = min(map(len, curves))
         table, trials = np.array([c[:length] for c in curves]), np.arange(1, length + 1)
-        if len(curves) > 1:
-            ax.plot(trials, table.T, color=colour, linewidth=0.4, alpha=0.3, zorder=2)
+        for curve in curves if len(curves) > 1 else ():
+            single = {"color": colour, "linewidth": 0.4, "alpha": 0.3, "zorder": 2}
+            ax.plot(np.arange(1, len(curve) + 1), curve, **single)
         low, median, high = np.quantile(table, [0.25, 0.5, 0.75], axis=0)
         ax.fill_between(trials, low, high, color=colour, alpha=0.2, linewidth=0, zorder=3)
         count = f"{name} ({len(curves)} seeds)" if len(curves) > 1 else name
@@ -402,6 +410,7 @@ def learning_curves(
         if reference is not None:
             ax.set_ylim(bottom=0.75 * reference[1])
     ax.set(xlabel="trial", ylabel=label)
+    ax.xaxis.set_major_locator(MaxNLocator("auto", steps=[1, 2, 2.5, 5, 10], integer=True))
     ax.margins(x=0.01)
     ax.legend()
 
@@ -410,6 +419,7 @@ def learning_curves(
 def pose_error(path: "Trajectory", ax: Axes, plan: "MazePlan | None" = None) -> None:
     """Distance between true and estimated position along a trial, sub-goals shaded."""
     error = 1000 * np.hypot(*(path.true - path.estimated)[:, :2].T)
+    before = -math.inf
     for number, centre in enumerate(plan.subgoals if plan else [], 1):
         inside = np.hypot(*(path.true[:, :2] - centre).T) < plan.subgoal_radius
         edges = np.flatnonzero(np.diff(inside, prepend=False, append=False)).reshape(-1, 2)
@@ -417,7 +427,10 @@ def pose_error(path: "Trajectory", ax: Axes, plan: "MazePlan | None" = None) -> 
             ax.axvspan(first - 0.5, last - 0.5, color="0.88", zorder=0)
         if len(edges):
             place = {"xycoords": ("data", "axes fraction"), "ha": "center"}
-            _note(ax, f"sub-goal {number}", (edges[0].mean() - 0.5, 1), 2, **place)
+            middle = edges[0].mean() - 0.5
+            shift = 10 if abs(middle - before) < len(error) / 5 else 2  # above a label beside it
+            _note(ax, f"sub-goal {number}", (middle, 1), shift, **place)
+            before = middle
     ax.plot(error, color=BLUE, linewidth=1.2)
     ax.set(
         xlabel="decision", ylabel="error of the estimated position [mm]", xlim=(0, len(error) - 1)

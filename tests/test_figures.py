@@ -144,6 +144,8 @@ def test_learning_curves_are_medians_of_the_common_trials(tmp_path, axes):
     median = next(line for line in axes.lines if line.get_label() == "SOFNN (3 seeds)")
     assert median.get_xdata().tolist() == [1, 2, 3]
     assert median.get_ydata().tolist() == [900, 700, 510]
+    assert [900, 700, 500, 480] in [list(line.get_ydata()) for line in axes.lines]
+    assert all(tick == round(tick) for tick in axes.get_xticks())
     assert axes.get_yscale() == "log"
     assert figures.read_column(paths[0], "success").tolist() == [1, 1, 1, 1]
     with pytest.raises(ValueError, match="rules"):
@@ -159,6 +161,16 @@ def test_pose_error_is_in_millimetres_and_marks_the_subgoals(plan, axes):
     assert axes.lines[0].get_ydata() == pytest.approx([0, 5, 0, 2])
     assert [text.get_text() for text in axes.texts] == ["sub-goal 1"]
     assert "[mm]" in axes.get_ylabel()
+
+
+def test_labels_of_near_subgoals_do_not_overlap(plan):
+    far = np.linspace((0.15, 0.15), (0.7, 0.15), 100)
+    true = np.concatenate([far, [plan.subgoals[0], (0.5, 0.5), plan.subgoals[1], plan.goal]])
+    figure, (axes,) = figures.canvas(width=3.8, height=3)
+    figures.pose_error(Trajectory(true, true), axes, plan)
+    figure.draw_without_rendering()
+    first, second = (text.get_window_extent() for text in axes.texts)
+    assert first.x1 > second.x0 and first.y1 <= second.y0
 
 
 def test_a_figure_becomes_a_png_of_its_size(plan):

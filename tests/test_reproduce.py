@@ -251,14 +251,14 @@ def test_medians_come_with_intervals_that_contain_them():
 @pytest.mark.parametrize(
     ("estimate", "text"),
     [
-        ((1234.5, 1000, 2000), "1,234 (1,000 to 2,000)"),
+        ((1234.5, 1000, 2000.5), "1,235 (1,000 to 2,001)"),
         ((151, 80, 151), "> 150 (80 to > 150)"),
         ((151, math.nan, math.nan), "> 150"),
         ((math.nan, math.nan, math.nan), "-"),
     ],
 )
 def test_cells(estimate, text):
-    limit = math.inf if "1,234" in text else 150
+    limit = math.inf if "1,235" in text else 150
     assert results.cell(evaluate.Estimate(*estimate), limit=limit) == text
 
 
@@ -379,8 +379,8 @@ def test_claims_and_goals_follow_the_data(written):
     assert reached["SGA", "steps at most 516"] == "yes"
     assert reached["Q-learning", "steps within 1.10 of the optimum"] == "no"  # 520 / 468
     text = (written / "section5.md").read_text()
-    assert "| Q-learning with FSFNN: rules | 9,216 | 1,152 |" in text
-    assert "| > 30 |" in text and " nan" not in text
+    assert r"| Q-learning with FSFNN: rules | 9,216 \* | 1,152 |" in text
+    assert "| > 30 |" in text and " nan" not in text and "diverged" not in text
 
 
 def test_every_figure_is_there_and_shown(written):
@@ -391,6 +391,28 @@ def test_every_figure_is_there_and_shown(written):
         assert np.ptp(np.asarray(picture.convert("L"))) > 200
         assert (written / f"figures/{name}.svg").read_text().startswith("<?xml")
         assert f"](figures/{name}.png)" in text
+
+
+def test_tables_and_captions_say_which_seeds_diverged(written, tmp_path):
+    for file in [*written.glob("section5*.csv"), written / "section5.json"]:
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+    half, none = "q-sofnn-estimated", "sga-fixed-estimated"
+    rows = results.read_table(written / "section5.csv")
+    for row in rows:
+        if row["arm"] == none or (row["arm"] == half and row["seed"] < 4):
+            row["status"] = "diverged"
+    results.write_table(tmp_path / "section5.csv", rows)
+    curves = results.read_table(written / "section5-curves.csv")  # none: diverged in trial 1
+    results.write_table(
+        tmp_path / "section5-curves.csv", [row for row in curves if row["arm"] != none]
+    )
+    assert report.write(tmp_path) == 0
+    text = (tmp_path / "section5.md").read_text()
+    assert f"| {none} |  | 8 | 0; 8 of 8 seeds diverged |{' - |' * 8}\n" in text
+    assert f"| {half} |  | 8 | 8; 4 of 8 seeds diverged | 2" in text
+    assert "0 of 8 seeds (0 to 32 %); 8 of 8 seeds diverged" in text
+    assert text.count("SOFNN: the median ends where a seed diverged.") == 2  # Figs 8 and 9
+    assert "A seed *diverged* if" in text
 
 
 def test_a_report_can_be_written_again(written, tmp_path, monkeypatch):

@@ -22,6 +22,7 @@ AGENTS = {"sga": "SGA", "q": "Q-learning"}
 NETWORKS = {"sofnn": "SOFNN", "fixed": "FSFNN"}
 BAND = "Line: median over the seeds; band: interquartile range; faint: each seed."
 LIMIT = "A trial that ends without the goal counts with its limit."
+MARKERS = [("o", 7), ("s", 4), ("^", 5), ("D", 2)]  # hollow: equal values are seen in each other
 Caption = tuple[str, str]  # file without suffix, text
 
 
@@ -53,7 +54,8 @@ def _figures(data: Data) -> Iterator[tuple[str, Figure | None, str]]:
     if study.conditions and "conditions" in data.tables:
         text = (
             "Robustness: success (mean over the seeds) and steps (median and interquartile band; a "
-            "trial that fails counts with its limit) of the greedy policy in changed conditions."
+            "trial that fails counts with its limit) of the greedy policy in changed conditions; "
+            "the axes do not begin at zero."
         )
         yield "conditions", robustness(data), text
 
@@ -63,15 +65,13 @@ def _of_the_paper(data: Data) -> Iterator[tuple[str, Figure | None, str]]:
     yield "fig6", maze(plan), "Fig. 6: the maze, as rendered and as a plan."
     optimum = ("kinematic optimum", data.info["optimum"])
     for number, agent in ((7, "sga"), (8, "q")):
-        arms = _curves(data, {t: f"{agent}-{n}-estimated" for n, t in NETWORKS.items()}, "steps")
-        if arms:
+        names = {text: f"{agent}-{network}-estimated" for network, text in NETWORKS.items()}
+        if arms := _curves(data, names):
             figure, (ax,) = figures.canvas(width=5, height=3.3)
             figures.learning_curves(arms, ax, reference=optimum)
             _legend_above(ax)
-            text = (
-                f"Fig. {number}: steps to the goal, {AGENTS[agent]}, estimated pose. {BAND} {LIMIT}"
-            )
-            yield f"fig{number}", figure, text
+            text = f"Fig. {number}: steps to the goal, {AGENTS[agent]}, estimated pose. {BAND} "
+            yield f"fig{number}", figure, text + LIMIT + _diverged(data, names)
     names = {
         f"{AGENTS[agent]}, {text}": f"{agent}-{network}-estimated"
         for agent in AGENTS
@@ -83,11 +83,13 @@ def _of_the_paper(data: Data) -> Iterator[tuple[str, Figure | None, str]]:
         ax.yaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
         ax.set_ylim(bottom=0)
         _legend_above(ax)
-        yield "fig9", figure, f"Fig. 9: number of rules after each trial, estimated pose. {BAND}"
-    panels = {
-        agent: _curves(data, {f"{p} pose": f"{agent}-sofnn-{p}" for p in ("estimated", "true")})
+        text = f"Fig. 9: number of rules after each trial, estimated pose. {BAND}"
+        yield "fig9", figure, text + _diverged(data, names)
+    poses = {
+        agent: {f"{pose} pose": f"{agent}-sofnn-{pose}" for pose in ("estimated", "true")}
         for agent in AGENTS
     }
+    panels = {agent: _curves(data, names) for agent, names in poses.items()}
     if all(len(arms) == 2 for arms in panels.values()):
         figure, axes = figures.canvas(2, width=3.8, height=3.3)
         for ax, (agent, arms) in zip(axes, panels.items(), strict=True):
@@ -95,17 +97,15 @@ def _of_the_paper(data: Data) -> Iterator[tuple[str, Figure | None, str]]:
             _legend_above(ax, columns=1)
             ax.set_title(f"{AGENTS[agent]}, SOFNN", y=1.18)
         axes[1].sharey(axes[0])
-        yield (
-            "fig10",
-            figure,
-            f"Fig. 10: steps to the goal with estimated and true pose. {BAND} {LIMIT}",
-        )
+        text = f"Fig. 10: steps to the goal with estimated and true pose. {BAND} {LIMIT}"
+        names = {f"{AGENTS[a]}, {t}": arm for a, arms in poses.items() for t, arm in arms.items()}
+        yield "fig10", figure, text + _diverged(data, names)
     paths = {agent: last_paths(data, f"{agent}-sofnn-estimated") for agent in AGENTS}
     if any(paths.values()):
         figure, axes = figures.canvas(2, width=3.8, height=3)
         for ax, (agent, found) in zip(axes, paths.items(), strict=True):
             pose_errors(found, ax, plan)
-            ax.set_title(f"{AGENTS[agent]}, SOFNN", y=1.06)
+            ax.set_title(f"{AGENTS[agent]}, SOFNN", y=1.1)
         yield (
             "fig11",
             figure,
@@ -120,6 +120,12 @@ def _legend_above(ax: Axes, columns: int = 2) -> None:
     """Where it covers nothing; matplotlib's search for such a place is slow with many curves."""
     with matplotlib.rc_context(figures.STYLE):
         ax.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=columns, borderaxespad=0.2)
+
+
+def _diverged(data: Data, names: dict[str, str]) -> str:
+    """For a caption: which curves end early."""
+    labels = [label for label, arm in names.items() if data.diverged(arm)]
+    return f" {' and '.join(labels)}: the median ends where a seed diverged." * bool(labels)
 
 
 def _curves(data: Data, names: dict[str, str], quantity: str = "steps") -> dict[str, Any]:
@@ -187,8 +193,8 @@ def robustness(data: Data, policy: str = "greedy") -> Figure:
     figure = Figure(figsize=(2.4 * len(groups), 4.6), layout="constrained")
     axes = figure.subplots(2, len(groups), sharex="col", sharey="row", squeeze=False)
     for column, group in enumerate(groups):
-        for (arm, (colour, line)), marker in zip(
-            zip(data.arms(), figures.SERIES, strict=False), "os^D", strict=False
+        for arm, (colour, line), (marker, size) in zip(
+            data.arms(), figures.SERIES, MARKERS, strict=False
         ):
             chosen = [row for row in rows if (row["arm"], row["group"]) == (arm, group)]
             values = sorted({row["value"] for row in chosen})
@@ -204,10 +210,12 @@ def robustness(data: Data, policy: str = "greedy") -> Figure:
                     middle = [np.mean(v) for v in table]
                 else:
                     ax.fill_between(values, low, high, color=colour, alpha=0.15, linewidth=0)
-                style = {"marker": marker, "markersize": 3.5, "linewidth": 1.2}
+                style = {"marker": marker, "markersize": size, "linewidth": 1.2}
+                style |= {"markerfacecolor": "none", "markeredgewidth": 0.9}
                 ax.plot(values, middle, color=colour, linestyle=line, label=_name(arm), **style)
         axes[1, column].set_xlabel(group.replace(" [", "\n["))
-    axes[0, 0].set(ylabel="success [%]", ylim=(-3, 103))
+    axes[0, 0].set(ylabel="success [%]")
+    axes[0, 0].set_ylim(min(90, axes[0, 0].get_ylim()[0]), 101)
     axes[1, 0].set(ylabel="steps, all trials")
     figures.logarithmic(axes[1, 0], subs=range(1, 10))
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper center", ncols=4)

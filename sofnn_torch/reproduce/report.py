@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from sofnn_torch.reproduce import drawing
-from sofnn_torch.reproduce.claims import HOW, arriving, claims, closing_table, goals
+from sofnn_torch.reproduce.claims import HOW, SWAPPED, arriving, claims, closing_table, goals
 from sofnn_torch.reproduce.drawing import AGENTS
 from sofnn_torch.reproduce.results import (
     Data,
@@ -29,9 +29,14 @@ brackets; success is the mean over the seeds. *Arriving* is the number of seeds 
 the first {in_a_row} in a row under {within} times the optimum (in training, so exploration
 included); a run where that never happens counts as more than its number of trials. What was
 learned is then played for {episodes} trials without learning: *greedy* is the mean action (SGA) or
-the best one (Q), *sampled* the stochastic policy of the training. A trial that fails counts with
-its {limit:,} steps. The kinematic optimum of the maze is {optimum} steps
+the best one (Q), *sampled* the stochastic policy of the training; both gain chance at a rule from
+the robot's fourth return to it in a trial on, so that they leave
+[circles](../paper.md#what-plays-in-an-evaluation-and-loops). A trial that fails counts with its
+{limit:,} steps. The kinematic optimum of the maze, with actions held 10 steps, is {optimum} steps
 (`python -m sofnn_torch.optimum`)."""
+DIVERGED = """\
+A seed *diverged* if its numbers left all bounds, where the training stops. It counts as one that
+never reaches the goal, with the rules of its last whole trial; an arm of nothing else shows `-`."""
 CONDITION_NOTES = """\
 Greedy policy, 10 trials for each seed; mean success and median steps over the seeds, with 95 %
 intervals. The robot is told the pose that it starts from, scattered or not, as at every pass of
@@ -57,8 +62,11 @@ def arm_table(data: Data, arms: Sequence[str]) -> str:
         flags = data.info["arms"][arm]["changes"]
         greedy = data.column(arm, "greedy_steps")
         row = [arm, *[f"`{flags}`" if flags else ""] * changes, str(len(greedy))]
+        row.append(data.remark(str(arriving(data, arm)[0]), arm))
+        if data.diverged(arm) == len(greedy):
+            rows.append(row + ["-"] * (len(head) - len(row)))
+            continue
         row += [
-            str(arriving(data, arm)[0]),
             cell(learned_after(data, arm), limit=data.column(arm, "trials")[0]),
             cell(mean(data.column(arm, "greedy_success")), 1, 100),
             cell(median(greedy)),
@@ -114,12 +122,12 @@ def page(out: Path, data: Data) -> str:
     limit = max(arm["config"]["maze"]["max_steps"] for arm in info["arms"].values())
     trials = sorted({arm["config"]["trials"] for arm in info["arms"].values()})
     length = f"Runs of {' or '.join(map(str, trials))} trials."
-    parts = [f"# {info['title']}", f"{info['about']} {length}"]
+    parts = [f"# {info['title']}", f"{study.about} {length}"]
     if info["quick"]:
         parts.append("**A quick look with short runs: the numbers mean nothing.**")
     if study.figures:
         parts += ["## Beside the paper's numbers"]
-        parts += [markdown(["", "paper", "here", "over the optimum"], closing_table(data))]
+        parts += [markdown(["", "paper", "here", "over the optimum"], closing_table(data)), SWAPPED]
         parts += ["## The paper's claims"]
         parts += [markdown(["claim", "criterion", "measured", "verdict"], claims(data), 4), HOW]
         if (out / "fixed.csv").exists():
@@ -135,6 +143,7 @@ def page(out: Path, data: Data) -> str:
             *(f"![{text.partition(':')[0]}]({name}.png)\n\n*{text}*" for name, text in captions),
         ]
     parts += ["## All arms", arm_tables(data), NOTES.format(limit=limit, **info)]
+    parts += [DIVERGED] * bool(data.diverged(*info["arms"]))
     return "\n\n".join(part.strip() for part in [*parts, "## Provenance", provenance(info)]) + "\n"
 
 

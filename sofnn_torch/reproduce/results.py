@@ -39,6 +39,16 @@ class Data:
         """A column over the seeds of an arm; empty if the arm has no run."""
         return np.array([row[column] for row in self.rows if row["arm"] == arm], float)
 
+    def diverged(self, *arms: str) -> int:
+        """How many runs of the arms diverged."""
+        return sum(row["arm"] in arms and row["status"] == "diverged" for row in self.rows)
+
+    def remark(self, text: str, *arms: str) -> str:
+        """What is said of the arms, and how many of their seeds diverged if any did."""
+        if not (count := self.diverged(*arms)):
+            return text
+        return f"{text}; {count} of {sum(row['arm'] in arms for row in self.rows)} seeds diverged"
+
     def curves(self, arm: str, quantity: str) -> list[NDArray[np.float64]]:
         """A quantity of every trial, for each seed of an arm."""
         rows = self.tables.get("curves", [])
@@ -148,7 +158,7 @@ def cell(estimate: Estimate, digits: int = 0, factor: float = 1, limit: float = 
     def show(value: float) -> str:
         if factor * value > limit:
             return f"> {limit:,.{digits}f}"
-        return f"{factor * value:,.{digits}f}"
+        return f"{factor * value + 1e-9:,.{digits}f}"  # halves go up, not to the even number
 
     if math.isnan(estimate.value):
         return "-"

@@ -184,9 +184,9 @@ STUDIES: dict[str, Study] = {
     ),
     "fixed": Study(
         "The fixed network, tuned fairly",
-        "The same search for both learners: widths of the membership functions, held and "
-        "trained (at the paper's rate, and at one that suits rewards of 100), and the finer grid. "
-        "FSFNN, estimated pose.",
+        "The same search for both learners: widths of the membership functions, held or trained "
+        "with their centres (at the paper's rate, and at one that suits rewards of 100), and the "
+        "finer grid. FSFNN, estimated pose.",
         _search("sga") | _search("q"),
     ),
     "robustness": Study(
