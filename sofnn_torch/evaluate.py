@@ -5,7 +5,7 @@
     python -m sofnn_torch.evaluate RUN --video run.mp4 --viewer
 
 By default the robot takes the mean action (SGA) or the greedy one (Q-learning); with --explore it
-samples its learned stochastic policy. From its fourth return to the same rule in a trial on, the
+samples its learned stochastic policy. After the fourth decision at the same rule in a trial the
 policy gains chance at that rule, so that it leaves circles. Nothing is learned and the run
 directory is not changed.
 """
