@@ -9,6 +9,7 @@ called outside. `--checkout` profiles another checkout, for a before and after.
 """
 
 import re
+import shlex
 import subprocess
 import sys
 import tempfile
@@ -19,17 +20,27 @@ from timing import arguments, report
 
 HERE = Path(__file__).parents[1]
 FRAME = re.compile(r"([^;]+) \(([^;:]+)[^;]*\)")
-QUIET = "--quiet --picture-every 0 --video-every 0"
+QUIET = ("--quiet", "--picture-every", "0", "--video-every", "0")
 TOP = 14
 
 
-def profile(checkout: Path, flags: str) -> tuple[Counter[str], float]:
+def profile(checkout: Path, flags: list[str]) -> tuple[Counter[str], float]:
     """Samples by function, and the seconds of the run."""
     with tempfile.TemporaryDirectory() as place:
         stacks = Path(place, "stacks.txt")
-        command = f"py-spy record --rate 500 --format raw --output {stacks} -- {sys.executable}"
-        command += f" {checkout / 'train.py'} {flags} {QUIET} --runs {place}/runs"
-        subprocess.run(command.split(), check=True, cwd=checkout, capture_output=True)
+        command = [
+            Path(sys.executable).with_name("py-spy"),
+            "record",
+            "--rate",
+            "500",
+            "--format",
+            "raw",
+            "--output",
+            stacks,
+        ]
+        command += ["--", sys.executable, checkout / "train.py", *flags, *QUIET]
+        command += ["--runs", Path(place, "runs")]
+        subprocess.run(command, check=True, cwd=checkout, capture_output=True)
         samples: Counter[str] = Counter()
         for line in stacks.read_text().splitlines():
             stack, _, count = line.rpartition(" ")
@@ -51,15 +62,14 @@ def innermost(frames: list[tuple[str, str]]) -> str:
 
 def main() -> None:
     """Profile, print a table, and write it as JSON."""
-    texts = {"flags": "flags of train.py", "checkout": "directory of another checkout"}
-    options = arguments(__doc__, repeats=1, **texts)
-    flags = str(options.flags or "--trials 60")
-    samples, seconds = profile((options.checkout or HERE).resolve(), flags)
+    text = "directory of another checkout"
+    options = arguments(__doc__, repeats=1, flags="--trials 60", checkout=text)
+    samples, seconds = profile((options.checkout or HERE).resolve(), options.flags)
     rows = [
         {"function": name, "% of the time": 100 * count / samples.total()}
         for name, count in samples.most_common(TOP)
     ]
-    run = [{"flags": flags, "seconds": seconds, "samples": samples.total()}]
+    run = [{"flags": shlex.join(options.flags), "seconds": seconds, "samples": samples.total()}]
     report(options, run=run, functions=rows)
 
 

@@ -9,18 +9,14 @@ medians of the ratios in each repeat.
     python benchmarks/physics.py --out physics.json
 """
 
-import argparse
-import json
 import math
-import os
-import platform
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 
 import mujoco
 import numpy as np
+from timing import arguments, median, ratio, report
 
 from sofnn_torch.odometry import MotorNoise, wrap_angle
 from sofnn_torch.optimum import optimal_steps
@@ -146,11 +142,11 @@ def rough_drive(robot: Robot, steps: int = 3000) -> tuple[float, float]:
     return longest, deepest
 
 
-def seconds_per_step(robot: Robot, speeds: list[tuple[float, float]]) -> float:
+def microseconds_per_step(robot: Robot, speeds: list[tuple[float, float]]) -> float:
     """Return the time of one 0.5 s step."""
     begin = time.perf_counter()
     robot.run(speeds)
-    return (time.perf_counter() - begin) / len(speeds)
+    return (time.perf_counter() - begin) / len(speeds) * 1e6
 
 
 def stage_times(robot: Robot, repeats: int) -> dict[str, float]:
@@ -179,64 +175,37 @@ def stage_times(robot: Robot, repeats: int) -> dict[str, float]:
 
 
 def main() -> None:
-    """Measure, print a table, and write it as JSON."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--repeats", type=int, default=15)
-    parser.add_argument("--out", type=Path, help="JSON file to write")
-    arguments = parser.parse_args()
-
+    """Measure, print tables, and write them as JSON."""
+    options = arguments(__doc__, repeats=15)
     robots = {variant.name: variant.build() for variant in VARIANTS}
     reference = robots[VARIANTS[0].name]
     run = optimal_run(reference)
     pushing = [STRAIGHT] * 258 + [LEFT] * 4 + [STRAIGHT] * 254  # most of it against a wall
 
-    times = {name: [] for name in robots}
-    times["ours, pushing against a wall"] = []
-    for _ in range(arguments.repeats):
+    times: dict[str, list[float]] = {name: [] for name in [*robots, "pushing"]}
+    for _ in range(options.repeats):
         for name, robot in robots.items():
-            times[name].append(seconds_per_step(robot, run))
-        times["ours, pushing against a wall"].append(seconds_per_step(robots["ours"], pushing))
+            times[name].append(microseconds_per_step(robot, run))
+        times["pushing"].append(microseconds_per_step(robots["ours"], pushing))
+    alone = {name: np.array(values) for name, values in times.items()}
+    over = {name: ratio(values, alone[VARIANTS[0].name]) for name, values in alone.items()}
 
     rows = []
-    reference.run(run)
-    reference_times = np.array(times[VARIANTS[0].name])
-    for name, values in times.items():
-        row = {
-            "name": name,
-            "us_per_step": float(np.median(values)) * 1e6,
-            "ratio": float(np.median(np.array(values) / reference_times)),
-        }
-        if name in robots:
-            robot = robots[name]
-            robot.run(run)
-            position, heading = end_difference(robot, reference)
-            longest, deepest = rough_drive(robot)
-            row |= {
-                "end_difference_mm": position * 1e3,
-                "end_difference_rad": heading,
-                "longest_step_mm": longest * 1e3,
-                "deepest_mm": deepest * 1e3,
-            }
-            reference.run(run)
-        rows.append(row)
-
-    print(
-        f"{platform.machine()}, {os.cpu_count()} cores, MuJoCo {mujoco.__version__}; a 0.5 s step:"
+    for name, robot in robots.items():
+        reference.run(run)
+        robot.run(run)
+        position, heading = end_difference(robot, reference)
+        longest, deepest = rough_drive(robot)
+        row = {"variant": name, "us/step": median(alone[name]), "ratio": over[name]}
+        row |= {"end mm": position * 1e3, "end rad": heading}
+        rows.append(row | {"longest step mm": longest * 1e3, "deepest mm": deepest * 1e3})
+    stages = stage_times(robots["ours"], options.repeats)
+    report(
+        options,
+        a_step_of_half_a_second=rows,
+        pushing_against_a_wall=[{"us/step": median(alone["pushing"]), "ratio": over["pushing"]}],
+        one_timestep_of_ours=[{"stage": name, "us": value} for name, value in stages.items()],
     )
-    print(f"{'':36}     us  ratio | end mm     rad | random drive: step mm, deepest mm")
-    for row in rows:
-        line = f"{row['name']:36} {row['us_per_step']:6.1f} {row['ratio']:6.3f}"
-        if "deepest_mm" in row:
-            line += f" | {row['end_difference_mm']:6.2f} {row['end_difference_rad']:7.4f}"
-            line += f" | {row['longest_step_mm']:8.2f} {row['deepest_mm']:8.2f}"
-        print(line)
-    stages = stage_times(robots["ours"], arguments.repeats)
-    print("microseconds in one timestep of ours (of which 10 make a step):")
-    print("  " + ", ".join(f"{name} {value:.2f}" for name, value in stages.items()))
-    if arguments.out:
-        machine = {"cores": os.cpu_count(), "mujoco": mujoco.__version__}
-        result = {**machine, "repeats": arguments.repeats, "rows": rows, "stages_us": stages}
-        arguments.out.write_text(json.dumps(result, indent=2) + "\n")
 
 
 if __name__ == "__main__":

@@ -5,6 +5,7 @@ import gc
 import json
 import os
 import platform
+import shlex
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -59,9 +60,11 @@ def median(values: np.ndarray) -> float:
     return float(np.median(values))
 
 
-def arguments(doc: str, repeats: int, **paths: str) -> argparse.Namespace:
-    """The options of every benchmark, and paths with their help."""
+def arguments(doc: str, repeats: int, flags: str = "", **paths: str) -> argparse.Namespace:
+    """The options of every benchmark, paths with their help, and flags of a run if there is one."""
     parser = argparse.ArgumentParser(description=doc.splitlines()[0])
+    if flags:
+        parser.add_argument("--flags", type=shlex.split, default=flags, help="flags of train.py")
     parser.add_argument("--repeats", type=int, default=repeats)
     for name, text in {"out": "JSON file to write", **paths}.items():
         parser.add_argument(f"--{name}", type=Path, help=text)
@@ -93,5 +96,5 @@ def report(options: argparse.Namespace, **tables: list[dict[str, Any]]) -> None:
 
 def _cell(value: Any) -> str:
     if isinstance(value, float):
-        return f"{value:,.2f}" if value < 100 else f"{value:,.0f}"
+        return f"{value:.3g}" if value < 100 else f"{value:,.0f}"
     return f"{value:,}" if isinstance(value, int) else str(value)

@@ -14,9 +14,8 @@ from typing import Any
 from joblib import Parallel, delayed
 from tqdm import tqdm
 
-from sofnn_torch import checkpoint, evaluate, runs, seeds, training
+from sofnn_torch import checkpoint, evaluate, runs, seeds, session, training
 from sofnn_torch.config import Config, from_dict
-from sofnn_torch.factory import make_agent, make_env
 from sofnn_torch.figures import read_column
 from sofnn_torch.guard import Divergence, Interrupted, SignalTrap
 from sofnn_torch.monitoring import Trajectory, TrialRecord
@@ -186,8 +185,7 @@ def last_trial(path: Path) -> tuple[TrialRecord, Trajectory]:
     """
     file = checkpoint.checkpoints(path)[1]
     config, state = runs.load_config(path), checkpoint.load(file)
-    agent, env = make_agent(config), make_env(config)
-    env.reset(seed=training.environment_seed(config))
+    agent, env = session.build(config)
     checkpoint.restore(file, state, agent, env)
     for _ in range(state["trial"], config.trials):
         record, trajectory = training.play(env, agent)
