@@ -1,5 +1,6 @@
 """Checkpoint files: whole or not there, and every damage is noticed."""
 
+import copy
 import io
 import os
 import random
@@ -78,13 +79,18 @@ def test_a_restored_agent_and_maze_go_on_alike(state, run):
     assert not equal(ends[0][2]["agent"], state["agent"])
 
 
-def test_a_snapshot_does_not_change_with_the_agent():
-    agent, env = make_agent(settings()), make_env(settings())
+@pytest.mark.parametrize("name", ["sga", "q"])
+def test_a_snapshot_does_not_change_with_the_agent(name):
+    agent, env = make_agent(settings(name)), make_env(settings(name))
     env.reset(seed=0)
-    first = checkpoint.snapshot(agent, env)
-    before = checkpoint.snapshot(agent, env)
     training.play(env, agent)
-    assert equal(first, before)
+    taken, buffer = checkpoint.snapshot(agent, env), io.BytesIO()
+    torch.save(taken, buffer)
+    buffer.seek(0)
+    before = torch.load(buffer)
+    training.play(env, agent)
+    assert equal(taken, before)
+    assert not equal(taken, checkpoint.snapshot(agent, env))
 
 
 def test_the_schema_of_the_document_is_that_of_the_file(state):
@@ -201,14 +207,14 @@ def edits(state):
 
 
 def edited(tree, place, value):
-    copy = dict(tree)
+    changed = copy.copy(tree)  # of the same type
     if len(place) > 1:
-        copy[place[0]] = edited(tree[place[0]], place[1:], value)
+        changed[place[0]] = edited(tree[place[0]], place[1:], value)
     elif value == "missing":
-        del copy[place[0]]
+        del changed[place[0]]
     else:
-        copy[place[0]] = value
-    return copy
+        changed[place[0]] = value
+    return changed
 
 
 def test_wrong_parts_inside_a_state_are_refused(state, tmp_path):
@@ -224,12 +230,26 @@ def test_wrong_parts_inside_a_state_are_refused(state, tmp_path):
 
 @pytest.mark.parametrize("rows,columns", [(-1, 0), (1, 0), (0, -1), (0, 1)])
 def test_wrong_shapes_are_refused(rows, columns, state, tmp_path):
-    net = dict(state["agent"]["net"])
+    net = copy.copy(state["agent"]["net"])
     for name in ("blocks.0", "traces_store"):
         a, b = net[name].shape
         net[name] = torch.zeros(a + rows, b + columns)
         rewrite(tmp_path / "shape.pt", edited(state, ("agent", "net"), net))
         assert "does not fit its settings" in refused(tmp_path / "shape.pt")
+
+
+@pytest.mark.parametrize("entry,value", [("theta", 0.9), ("max_rules", 7), ("rules", 1)])
+def test_a_state_of_another_network_is_refused(entry, value, state, tmp_path):
+    rewrite(tmp_path / "other.pt", edited(state, ("network", entry), value))
+    assert "does not fit its settings ({'n_inputs': 3" in refused(tmp_path / "other.pt")
+
+
+@pytest.mark.parametrize("place", [("net", "traces_store"), ("memory", "rows")])
+def test_numbers_of_another_precision_are_refused(place, state, tmp_path):
+    double = state["agent"][place[0]][place[1]].double()
+    rewrite(tmp_path / "double.pt", edited(state, ("agent", *place), double))
+    message = f"{place[1]} holds torch.float64, not torch.float32"
+    assert message in refused(tmp_path / "double.pt")
 
 
 @pytest.mark.parametrize("rules", [-1, 10**6])
@@ -357,20 +377,47 @@ def test_a_file_is_on_the_disk_before_it_takes_its_name(state, tmp_path, monkeyp
     assert calls == [("fsync", False), ("replace", True), ("fsync", True)]  # True: the directory
 
 
+def rewound(directory, state, data):
+    """The lines of a trial table that are left after going back to a state."""
+    run = Run.create(directory, "run", settings(), keep=3)
+    try:
+        (run.path / "trials.csv").write_bytes(data)
+        run.rewind(state)
+        return run.rows
+    finally:
+        run.close()
+
+
+@pytest.mark.parametrize(
+    "data,left",
+    [
+        (b"trial,x\n1,a\n2,b\n3,c\n4,d\n5,e\n6,f\n", "trial,x 1,a 2,b 3,c 4,d"),
+        (b"trial,x\n1,a\n2,b\n3,c\n4,d\n5,e", "trial,x 1,a 2,b 3,c 4,d"),
+        (b"trial,x\n1,a\n2,b\n3,c\n4,d", "trial,x 1,a 2,b 3,c"),
+        (b"trial,x\n0,z\n-1,y\n1,a\nx,1\n\n10,k\n3,c\n", "trial,x 1,a 3,c"),
+        (b"trial,x\n1,\xff\n", "trial,x 1,\ufffd"),
+        (b"trial,x", ""),
+        (b"", ""),
+    ],
+    ids=["newer", "torn", "last torn", "foreign", "not text", "torn header", "empty"],
+)
+def test_the_whole_lines_of_the_trials_of_a_state_are_left(data, left, state, tmp_path, capsys):
+    rows = rewound(tmp_path, state, data)
+    assert rows == [f"{row}\n" for row in left.split()]
+    assert ("lacks trials" in capsys.readouterr().err) == (
+        rows[1:] != ["1,a\n", "2,b\n", "3,c\n", "4,d\n"]
+    )
+    table = tmp_path / "run" / "trials.csv"
+    assert table.read_text() == "".join(rows) if rows else table.read_bytes() == data
+
+
 @trials_of(max_examples=100, deadline=None)
 @given(st.binary(max_size=400))
-def test_any_trial_table_is_cut_or_refused_in_one_line(state, data):
-    """A torn, foreign or empty trials.csv never ends a resume with a traceback."""
+def test_of_any_trial_table_only_whole_lines_of_known_trials_are_left(state, data):
     import tempfile
 
     with tempfile.TemporaryDirectory() as place:
-        directory = Path(place)
-        config = settings()
-        run = Run.create(directory, "run", config, keep=3)
-        (run.path / "trials.csv").write_bytes(data)
-        try:
-            run.rewind(state)
-        except ValueError as error:
-            assert "\n" not in str(error)
-        finally:
-            run.close()
+        rows = rewound(Path(place), state, data)
+    whole = iter(data.decode(errors="replace").splitlines(keepends=True))
+    assert all(row in whole and row.endswith("\n") for row in rows)  # in their order
+    assert all(int(row.partition(",")[0]) in (1, 2, 3, 4) for row in rows[1:])

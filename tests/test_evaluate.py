@@ -117,6 +117,22 @@ def test_evaluation_neither_learns_nor_grows(trained):
     assert (agent.net.table() == table).all()
 
 
+def test_the_seed_decides_the_motor_noise(trained):
+    config, agent, _, _ = evaluate.load(trained)
+    agent.act = lambda observation, explore: 1  # goes straight, and draws nothing
+    one, again, other = (evaluate.evaluate(config, agent, 1, seed=seed) for seed in (5, 5, 6))
+    assert one == again != other
+
+
+def test_the_seed_decides_the_sampled_actions(trained):
+    config, agent, _, _ = evaluate.load(trained)
+    still = replace(config, maze=replace(config.maze, motor_noise=0.0))
+    one, again, other = (
+        evaluate.evaluate(still, agent, 1, explore=True, seed=seed) for seed in (5, 5, 6)
+    )
+    assert one == again != other
+
+
 def test_a_damaged_checkpoint_is_named_and_the_one_before_is_taken(trained, tmp_path, capsys):
     copy = tmp_path / "run"
     copy.mkdir()

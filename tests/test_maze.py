@@ -118,6 +118,38 @@ def test_the_goal_ends_the_trial_and_pays_once_reached():
         assert info["steps"] == (math.ceil((distance - 0.06) / 0.005) if reached else 10)
 
 
+def test_a_trial_that_reaches_the_goal_in_its_last_step_is_not_cut_off():
+    env = KheperaMazeEnv(motor_noise=0.0, max_steps=3)
+    x, y = env.plan.goal
+    env.reset(options={"pose": (x - 0.073, y, 0.0)})
+    _, _, terminated, truncated, info = env.step(STRAIGHT)
+    assert info["total_steps"] == 3 and terminated and not truncated
+
+
+@pytest.fixture
+def bumping(monkeypatch):
+    """A maze whose robot feels a wall before it in every step, also where none is."""
+    env = KheperaMazeEnv(motor_noise=0.0, collision_reward=-0.5)
+    env.reset(seed=0)
+    monkeypatch.setattr(env.physics, "bumped", lambda: True)
+    monkeypatch.setattr(env.physics, "wall_bearings", lambda: [0.0])
+    return env
+
+
+def test_the_goal_counts_also_with_a_bump(bumping):
+    bumping.physics.place((*bumping.plan.goal, 0.0))
+    _, reward, terminated, _, info = bumping.step(LEFT)
+    assert terminated and info["collision"] and info["success"]
+    assert reward == 1.0 - 0.5
+
+
+def test_landmarks_count_also_with_a_bump(bumping):
+    bumping.physics.place((*bumping.plan.subgoals[0], 0.0))
+    _, reward, _, _, info = bumping.step(LEFT)
+    assert info["subgoals"] == (True, False) and reward == 0.5 - 0.5
+    np.testing.assert_array_equal(info["estimated_pose"], info["true_pose"])
+
+
 def test_a_bump_ends_the_decision():
     env = KheperaMazeEnv(motor_noise=0.0, collision_reward=-0.5)
     env.reset(options={"pose": (0.955, 0.15, 0.0)})
@@ -155,6 +187,20 @@ def test_a_trial_is_truncated_at_its_limit():
         env.step(LEFT)
 
 
+def test_the_trail_begins_where_the_robot_is_put():
+    env = KheperaMazeEnv()
+    env.reset(options={"pose": (0.4, 0.5, 1.0)})
+    assert env.trail == [(0.4, 0.5)]
+    env.reset()
+    assert env.trail == [env.plan.start[:2]]
+
+
+def test_a_literal_estimate_may_leave_the_arena_by_what_a_trial_can_drive():
+    space = KheperaMazeEnv(dead_reckoning="literal", max_steps=100).observation_space
+    assert space.low[:2] == pytest.approx([-0.5, -0.5])  # 100 steps of 5 mm
+    assert space.high[:2] == pytest.approx([1.5, 1.5])
+
+
 def test_steering_contains_the_three_actions():
     three, steer = KheperaMazeEnv(), KheperaMazeEnv(actions="steer")
     for action in (RIGHT, STRAIGHT, LEFT):
@@ -190,6 +236,26 @@ def test_a_restored_state_has_the_same_future(pose):
         assert info["total_steps"] == expected[4]["total_steps"]
         np.testing.assert_array_equal(info["true_pose"], expected[4]["true_pose"])
     np.testing.assert_array_equal(env.reset()[0], other.reset()[0])
+
+
+def test_a_restored_trial_knows_the_subgoals_it_has_found():
+    env, other = KheperaMazeEnv(), KheperaMazeEnv()
+    env.reset(seed=0)
+    env.physics.place((*env.plan.subgoals[1], 0.0))
+    assert env.step(LEFT)[1] == 0.5
+    other.load_state_dict(env.state_dict())
+    _, reward, _, _, info = other.step(LEFT)
+    assert info["subgoals"] == (False, True) and reward == 0.0
+
+
+def test_a_restored_trial_that_was_over_is_over():
+    env, other = KheperaMazeEnv(max_steps=10), KheperaMazeEnv()
+    env.reset(seed=0)
+    assert env.step(LEFT)[3]
+    other.reset()
+    other.load_state_dict(env.state_dict())
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        other.step(LEFT)
 
 
 @pytest.mark.parametrize(

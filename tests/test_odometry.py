@@ -26,6 +26,8 @@ def test_angles_are_wrapped_into_a_half_open_circle():
     assert (wrapped >= -math.pi).all() and (wrapped < math.pi).all()
     np.testing.assert_allclose(np.exp(1j * wrapped), np.exp(1j * angles), atol=1e-12)
     assert wrap_angle(math.pi) == -math.pi
+    just_outside = math.nextafter(-math.pi, -4.0)
+    assert -math.pi <= wrap_angle(just_outside) < math.pi
 
 
 def test_common_noise_is_that_of_the_khepera_simulator():
@@ -109,6 +111,23 @@ def test_an_estimate_slides_along_a_wall():
     estimator.update(-0.005, -0.005, [0.0])  # away from the wall
     x, y = 0.5 - 0.005 * math.sqrt(0.5), 0.5 + 2 * way - 0.005 * math.sqrt(0.5)
     assert estimator.pose[:2] == pytest.approx((x, y))
+
+
+def test_the_heading_of_an_estimate_is_wrapped_also_at_a_wall():
+    estimator = DeadReckoning()
+    estimator.fix((0.5, 0.5, math.pi - 0.01))
+    estimator.update(-0.002, 0.002, [0.0])
+    assert estimator.pose[2] == pytest.approx(-math.pi + 0.07)
+
+
+def test_an_estimate_stands_still_in_a_corner_as_the_robot_does():
+    env = KheperaMazeEnv(motor_noise=0.0)
+    env.reset(options={"pose": (0.972, 0.028, -0.5 * QUARTER)})
+    env.step(STRAIGHT)
+    assert env.physics.wall_bearings() == pytest.approx([-0.5 * QUARTER, 0.5 * QUARTER], abs=0.01)
+    before = env.estimator.pose
+    env.step(STRAIGHT)
+    assert env.estimator.pose == pytest.approx(before, abs=1e-6)
 
 
 @pytest.mark.parametrize("bearing", [0.1, 0.3, 0.5, 0.7, 0.9, 1.1, 1.3])

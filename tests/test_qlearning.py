@@ -111,6 +111,43 @@ def test_one_step_is_the_semi_gradient_update_with_the_brute_force_maximum():
     torch.testing.assert_close(agent.net.table().detach(), expected)
 
 
+@pytest.mark.parametrize("coding", CODINGS)
+def test_the_next_action_is_chosen_where_the_antecedents_have_moved_to(coding):
+    agent, seen = learner(coding, **RATES), []
+    values = agent.action_values
+    agent.action_values = lambda *given: seen.append(values(*given)) or seen[-1]
+    following = torch.tensor([0.3, 0.1, -2.0]).double()
+    agent.start(np.array([0.2, -0.3, 0.5]))
+    agent.step(0.5, following.numpy(), False)
+    for j in range(3):
+        features, state = chosen(agent, j, following)
+        q, _ = closed_form(agent.net, state, features)
+        assert seen[-1][j].item() == pytest.approx(q.item(), rel=1e-9)
+
+
+@pytest.mark.parametrize("rates", [{}, RATES], ids=["fixed", "learned"])
+@pytest.mark.parametrize("coding", CODINGS)
+def test_a_decision_counts_once_in_the_use_of_the_rules(coding, rates):
+    agent = learner(coding, **rates)
+    agent.start(np.zeros(3))
+    for _ in range(3):
+        agent.step(0.1, np.array([0.1, 0.2, 0.3]), False)
+    assert agent.net.usage.sum().item() == pytest.approx(4)
+
+
+def test_a_trial_that_is_cut_off_ends_with_what_its_last_state_is_worth():
+    agent, twin = learner(gamma=0.9), learner(gamma=0.9)
+    x, following = np.array([0.2, -0.3, 0.5]), np.array([0.3, 0.1, -2.0])
+    agent.start(x)
+    twin.start(x)
+    traces, dice = agent.net.traces.clone(), agent.rng.bit_generator.state
+    assert agent.step(0.5, following, False, truncated=True) is None
+    twin.step(0.5, following, False)
+    assert torch.equal(agent.net.table(), twin.net.table())
+    assert torch.equal(agent.net.traces, traces)  # no further action is chosen
+    assert agent.rng.bit_generator.state == dice
+
+
 @pytest.mark.parametrize("beyond", [-0.1, 0.1])
 def test_no_following_value_counts_for_more_than_the_limit(beyond):
     x, following = np.array([0.2, -0.3, 0.5]), np.array([0.3, 0.1, -2.0])
@@ -148,10 +185,28 @@ def test_the_roulette_survives_large_values():
     assert agent._roulette([1e6, 1e6 - 1, -1e9]) == 0
 
 
-def test_actions_are_uniform_inside_their_segment():
+@pytest.mark.parametrize("learns", [True, False])
+def test_actions_are_uniform_inside_their_segment(learns):
     agent = learner("scalar", actions="steer", segments=4, temperature=1e9)
-    sample = np.array([agent.start(np.zeros(3))[0] for _ in range(4000)])
+    decide = agent.start if learns else lambda x: agent.act(x, explore=1)
+    sample = np.array([decide(np.zeros(3))[0] for _ in range(4000)])
     assert stats.kstest(sample, "uniform", args=(-1, 2)).pvalue > 1e-3
+
+
+def test_a_scalar_action_is_drawn_inside_its_segment_also_for_three_actions():
+    agent, sample = learner("scalar", temperature=1e9), []
+    for _ in range(1000):
+        command = agent.start(np.zeros(3))
+        a = (agent.net.traces[-2, 0] / agent.net.traces[-1, 0]).item()  # gradients S a and S
+        assert command == int(1.5 * (a + 1))
+        sample.append(a)
+    assert stats.kstest(sample, "uniform", args=(-1, 2)).pvalue > 1e-3
+
+
+def test_the_first_rule_is_that_of_going_straight():
+    agent = learner("antecedent", rules=0)
+    agent.start(np.array([0.1, 0.2, 0.3]))
+    assert agent.net.centres[0].tolist() == pytest.approx([0.1, 0.2, 0.3, 0.0])
 
 
 def test_a_linear_scalar_action_never_prefers_the_middle():
@@ -166,8 +221,9 @@ def test_other_codings_can_prefer_the_middle(coding):
     assert 1 in [agent.act(np.array([0.1, 0.2, 0.3])) for agent in agents]
 
 
-def test_traces_are_cut_at_other_than_greedy_actions():
-    agent = learner(temperature=1e6, trace_decay=0.9, gamma=1.0, trace_limit=None)
+@pytest.mark.parametrize("cut", [True, False])
+def test_traces_decay_by_gamma_lambda_and_are_cut_at_other_than_greedy_actions(cut):
+    agent = learner(temperature=1e6, trace_decay=0.9, gamma=0.8, trace_cut=cut, trace_limit=None)
     x = np.array([0.1, 0.2, 0.3])
     agent.start(x)
     for _ in range(40):
@@ -175,8 +231,8 @@ def test_traces_are_cut_at_other_than_greedy_actions():
         agent.step(0.0, x, False)
         s = agent.net.normalised_firing(torch.from_numpy(x)[None])[0]
         carried = agent.net.traces[-1] - s  # the row of c always has the gradient S
-        kept = 0.9 * before[-1] if agent._log["greedy"][-1] else torch.zeros_like(s)
-        torch.testing.assert_close(carried, kept)
+        kept = 0.0 if cut and not agent._log["greedy"][-1] else 0.72
+        torch.testing.assert_close(carried, kept * before[-1])
     assert len(set(agent._log["greedy"])) == 2
 
 
@@ -188,13 +244,23 @@ def test_traces_stay_within_their_limit():
     assert agent.net.traces[-1].max() == 1.0
 
 
-def test_a_grown_learner_restores_bit_for_bit():
+def test_a_trial_begins_without_traces():
+    agent, x = learner(), np.array([0.4, -0.2, 0.8])
+    agent.start(np.array([0.1, 0.2, 0.3]))
+    agent.start(x)
+    expected = agent.net.normalised_firing(torch.from_numpy(x)).detach()
+    torch.testing.assert_close(agent.net.traces[-1], expected)
+
+
+@pytest.mark.parametrize("coding", ["onehot", "antecedent"])
+def test_a_grown_learner_restores_bit_for_bit(coding):
     xs = np.random.default_rng(1).uniform(-1, 1, (60, 3))
-    agent = learner("antecedent", rules=0)
+    agent = learner(coding, rules=0, rate_constant=0.1)
     agent.start(xs[0])
     for x in xs[1:30]:
         agent.step(-1.0, x, False)
-    twin = learner("antecedent", rules=0, seed=4)
+    assert agent.value != 0
+    twin = learner(coding, rules=0, seed=4, rate_constant=0.1)
     twin.load_state_dict(agent.state_dict())
     for x in xs[30:]:
         assert agent.step(-1.0, x, False) == twin.step(-1.0, x, False)

@@ -8,6 +8,7 @@ import torch
 from scipy import stats
 from test_qlearning import CODINGS
 from test_qlearning import learner as q_learner
+from test_sga import BOUNDED, single
 from test_sga import learner as sga_learner
 
 from sofnn_torch.replay import BATCH, ReplayMemory
@@ -146,6 +147,27 @@ def test_sga_replay_weighs_each_decision_by_its_likelihood(m, scaled, batch):
     agent.rng = np.random.default_rng(0)
     agent._replay()
     np.testing.assert_allclose(net.consequents.numpy(), expected, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize(("value", "limit", "counts"), BOUNDED)
+def test_no_following_value_counts_for_more_than_the_limit_in_replay(value, limit, counts):
+    agent, x = single(0.0, replays=1, value_limit=limit)
+    agent.start(x)
+    agent.step(0.2, x, False, truncated=True)
+    agent.net.blocks[0].data[-1, 0] = value
+    agent.start(x)
+    error = 0.2 + 0.9 * counts - value
+    assert agent.net.consequents[0, -1].item() == pytest.approx(value + 0.5 * error)
+
+
+def test_sga_remembers_the_action_that_it_sampled_not_the_clipped_one():
+    agent, x = single(0.0, replays=1)
+    agent.net.blocks[0].data[-3, 0] = 0.99
+    action = agent.start(x)
+    agent.step(0.0, x, True)
+    sampled = 0.99 + 0.5 * np.random.default_rng(0).standard_normal()
+    assert action == 1 < sampled
+    assert agent.memory.rows[0, 3] == pytest.approx(sampled)
 
 
 @pytest.mark.parametrize("make", [q_learner, sga_learner])

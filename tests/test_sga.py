@@ -89,6 +89,16 @@ def test_variance_scaling_multiplies_each_action_by_its_variance():
     torch.testing.assert_close(scaled.net.traces, plain.net.traces * variance)
 
 
+def test_the_learned_value_moves_no_antecedent():
+    agent = learner(variance_scaled=False, **ADAPTIVE)
+    x = torch.tensor([0.3, -0.2, 1.0], dtype=torch.float64)
+    agent.start(x.numpy())
+    mu, sigma, _ = agent.net(x[None])[0].tolist()
+    action = torch.tensor([mu + sigma * np.random.default_rng(0).standard_normal()])
+    torch.testing.assert_close(agent.net.traces[:-1], closed_form(agent.net, x, action, 1))
+    torch.testing.assert_close(agent.net.traces[-1], agent.net.normalised_firing(x).detach())
+
+
 def test_traces_accumulate_with_gamma_lambda():
     agent = learner(baseline="constant", gamma=0.9, trace_decay=0.5, sigma_max=9)
     x = np.array([0.1, 0.2, 0.3])
@@ -101,15 +111,25 @@ def test_traces_accumulate_with_gamma_lambda():
     )
 
 
+def test_a_trial_begins_without_traces():
+    agent = learner()
+    agent.start(np.array([0.1, 0.2, 0.3]))
+    x = np.array([0.4, -0.2, 0.8])
+    agent.start(x)
+    expected = agent.net.normalised_firing(torch.from_numpy(x)).detach()
+    torch.testing.assert_close(agent.net.traces[-1], expected)
+
+
 @pytest.mark.parametrize("factor", [True, False])
-def test_one_step_follows_equations_7_and_8(factor):
+@pytest.mark.parametrize("terminated", [True, False])
+def test_one_step_follows_equations_7_and_8(factor, terminated):
     rates = dict(ADAPTIVE, rate_mean=0.05, rate_deviation=0.002)
     agent = learner(
         baseline="constant", constant=0.25, gamma=0.99, one_minus_gamma=factor, sigma_max=9, **rates
     )
     agent.start(np.array([0.1, 0.2, 0.3]))
     before, traces = agent.net.table().detach().clone(), agent.net.traces.clone()
-    agent.step(1.0, np.array([0.1, 0.2, 0.4]), True)
+    agent.step(1.0, np.array([0.1, 0.2, 0.4]), terminated)
     alpha = torch.tensor([1e-3] * 6 + [0.05, 0.002])[:, None].double() * (0.01 if factor else 1)
     torch.testing.assert_close(agent.net.table().detach(), before + alpha * 0.75 * traces)
 
@@ -138,6 +158,51 @@ def test_the_end_of_a_trial_has_no_following_value():
     assert agent.step(1.0, x, True) is None
     expected = before + 0.5 * (1 - (s * before).sum()) * s
     torch.testing.assert_close(agent.net.consequents[:, -1], expected)
+
+
+def test_the_factor_1_minus_gamma_is_not_for_the_value():
+    agent = learner(gamma=0.9, one_minus_gamma=True, rate_value=0.5)
+    x = np.array([0.1, 0.2, 0.3])
+    agent.start(x)
+    before, s = agent.net.consequents[:, -1].clone(), agent.net.traces[-1].clone()
+    agent.step(1.0, x, True)
+    expected = before + 0.5 * (1.0 - (s * before).sum()) * s
+    torch.testing.assert_close(agent.net.consequents[:, -1], expected)
+
+
+def single(value, **settings):
+    """A learner of values alone with one rule of mu 0.2 and sigma 0.5, and the state there."""
+    rates = {"rate_mean": 0.0, "rate_deviation": 0.0, "rate_value": 0.5}
+    agent = learner(rules=1, gamma=0.9, **rates, **settings)
+    agent.net.blocks[0].data[-3:, 0] = torch.tensor([0.2, 0.5, value])
+    return agent, agent.net.centres[0].numpy().copy()
+
+
+BOUNDED = [(5.0, 2.0, 2.0), (1.0, 2.0, 1.0), (-1.0, 2.0, -1.0), (-5.0, 2.0, -2.0)]
+BOUNDED += [(5.0, None, 5.0), (-5.0, None, -5.0)]
+
+
+@pytest.mark.parametrize(("value", "limit", "counts"), BOUNDED)
+def test_no_following_value_counts_for_more_than_the_limit(value, limit, counts):
+    agent, x = single(value, value_limit=limit)
+    agent.start(x)
+    agent.step(0.2, x, False)
+    error = 0.2 + 0.9 * counts - value
+    assert agent.net.consequents[0, -1].item() == pytest.approx(value + 0.5 * error)
+    assert agent.statistics()["learning/error_rms"] == pytest.approx(abs(error))
+
+
+def test_a_trial_that_is_cut_off_ends_with_what_its_last_state_is_worth():
+    agent, x, following = learner(seed=3), np.array([0.1, 0.2, 0.3]), np.array([0.4, -0.2, 0.8])
+    twin = learner(seed=3)
+    agent.start(x)
+    twin.start(x)
+    traces, dice = agent.net.traces.clone(), agent.rng.bit_generator.state
+    assert agent.step(0.2, following, False, truncated=True) is None
+    twin.step(0.2, following, False)
+    assert torch.equal(agent.net.table(), twin.net.table())
+    assert torch.equal(agent.net.traces, traces)  # no further action is chosen
+    assert agent.rng.bit_generator.state == dice
 
 
 def test_sigma_and_mu_stay_in_bounds():
@@ -169,7 +234,7 @@ def test_log_likelihood_is_the_normal_density():
 
 
 @pytest.mark.parametrize(
-    ("mean", "command"), [(-0.9, RIGHT), (-0.3, STRAIGHT), (0.3, STRAIGHT), (0.9, LEFT)]
+    ("mean", "command"), [(-0.334, RIGHT), (-0.333, STRAIGHT), (0.333, STRAIGHT), (0.334, LEFT)]
 )
 def test_the_scalar_is_cut_into_three_actions(mean, command):
     agent = learner(rules=1)
@@ -191,6 +256,7 @@ def test_a_restored_learner_continues_bit_for_bit():
     agent.start(xs[0])
     for x in xs[1:30]:
         agent.step(0.01, x, False)
+    assert agent.value != 0
     twin = learner(rules=0, seed=5)
     twin.load_state_dict(agent.state_dict())
     for x in xs[30:]:

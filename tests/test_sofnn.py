@@ -1,6 +1,8 @@
 """The network against hand-computed values, symmetry and brute force (eqs 1-3)."""
 
+import copy
 import math
+import pickle
 
 import pytest
 import torch
@@ -100,6 +102,28 @@ def test_a_batch_in_one_product_is_as_exact_as_differences(dtype):
     torch.testing.assert_close(product.double(), exact, rtol=precision, atol=precision)
 
 
+def test_factors_are_double_where_single_precision_would_not_do():
+    generator = torch.Generator().manual_seed(0)
+    centres = 10 * torch.rand(3, 50, generator=generator)
+    widths = torch.full_like(centres, 0.01)  # (u / v)^2 is up to 1e6
+    x = centres.T + 0.01 * torch.randn(50, 3, generator=generator)
+    exact = -0.5 * ((x.double().unsqueeze(-1) - centres.double()) / widths.double()) ** 2
+    features = batches.features(x.double(), ())
+    product = batches.log_firing(features, batches.factors(centres, widths, ()), ())
+    error = (product - exact.sum(1)).diagonal().abs().max()
+    assert error < batches.PRECISION
+    assert batches.factors(centres, torch.ones_like(widths), ()).dtype == torch.float32
+
+
+def test_a_batch_takes_centres_of_any_turn():
+    net = network(periods=[0, 0, TAU])
+    for turns in (-2, 0, 1, 3):
+        net.add_rule(torch.tensor([0.5, 0.1 * turns, 0.3 + turns * TAU]).double())
+    x = states(batches.LARGE)
+    single = torch.stack([net.normalised_firing(row) for row in x])
+    torch.testing.assert_close(net.normalised_firing(x), single)
+
+
 def test_the_gradient_of_a_batch_is_the_sum_of_its_states():
     net, x = grown(), states(32, seed=3)
     weights = torch.rand(32, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
@@ -154,6 +178,48 @@ def test_growth_covers_every_visited_state():
         assert net.firing_strengths(x[None]).max() >= 0.4 - 1e-12
 
 
+@pytest.mark.parametrize("growth", ["rule", "input", "literal"])
+def test_observing_gives_the_firing_of_all_rules_the_new_one_included(growth):
+    net, added = network(theta=0.6, growth=growth), 0
+    for x in states(60):
+        before = net.n_rules
+        firing = net.observe(x)
+        added += before > 0 and net.n_rules > before
+        torch.testing.assert_close(firing, net.normalised_firing(x).detach())
+    assert added > 1
+
+
+def test_the_best_firing_is_a_firing_strength():
+    net = network()
+    net.add_rule(torch.tensor([0.5, 0.5, 0.0]).double())
+    net.observe(torch.tensor([0.6, 0.5, 0.0]).double())  # one width away
+    assert net.max_firing == pytest.approx(math.exp(-0.5))
+
+
+def test_a_rule_takes_part_from_a_hundredth_of_a_decision_on():
+    net = grown(width=0.001)
+    net.usage.zero_()
+    net.usage[:4] = torch.tensor([0.0, 0.009, 0.011, 3.0])
+    assert net.statistics([0.5])["rules/share_used"] == pytest.approx(2 / 300)
+    assert not net.usage.any()
+
+
+def test_a_shared_membership_function_keeps_its_centre_and_width():
+    net = network(growth="input")
+    net.add_rule(torch.tensor([0.5, 0.5, 0.0]).double(), torch.tensor([0.2, 0.3, 0.7]).double())
+    assert net.grow(torch.tensor([5.0, 0.6, 0.1]).double())  # new on x alone
+    assert net.centres[1].tolist() == [5.0, 0.5, 0.0]
+    assert net.widths[1].tolist() == pytest.approx([0.1, 0.3, 0.7])
+
+
+def test_an_empty_frozen_network_cannot_grow_and_says_so():
+    net, x = network(growth="frozen"), states(1)[0]
+    assert not net.grow(x)
+    with pytest.raises(ValueError, match=r"grid\(\)"):
+        net.observe(x)
+    assert net.n_rules == 0
+
+
 @settings(max_examples=60, deadline=None)
 @given(seed=st.integers(0, 10_000), theta=st.floats(0.05, 0.95))
 def test_the_output_does_not_jump_where_a_rule_is_added(seed, theta):
@@ -195,6 +261,24 @@ def test_pruning_keeps_the_rest_in_order():
     assert net.grow(torch.tensor([9.0, 9.0, 0.0]).double())
 
 
+def test_pruning_keeps_the_labels_of_shared_membership_functions():
+    net = grown(growth="input", theta=0.6)
+    keep = torch.arange(net.n_rules) % 3 > 0
+    expected = net.labels[:, keep].clone()
+    assert expected.unique().numel() > 3
+    net.prune(keep)
+    assert torch.equal(net.labels, expected)
+
+
+def test_a_replaced_rule_takes_no_label_of_another():
+    net = network(growth="input")
+    kept, new = torch.tensor([0.5, 0.5, 0.5]).double(), torch.tensor([0.1, 0.1, 0.1]).double()
+    net.add_rule(kept)
+    net.replace_rules(torch.stack([kept, new]), net.default_width.expand(2, 3), torch.zeros(2, 2))
+    assert net.labels[:, 0].tolist() == [0, 0, 0]
+    assert (net.labels[:, 1] != 0).all()
+
+
 def test_adapt_and_accumulate_follow_equations_6_and_8():
     net = grown(100, block_size=16)
     before, rows = net.table().detach().clone(), 2 * 3 + 2
@@ -205,6 +289,13 @@ def test_adapt_and_accumulate_follow_equations_6_and_8():
     torch.testing.assert_close(net.traces, 1.9 * gradient)
     net.adapt(rates)
     torch.testing.assert_close(net.table().detach(), before + rates * 1.9 * gradient)
+
+
+def test_the_limit_holds_the_traces_of_consequents_alone_on_both_sides():
+    net = grown(20)
+    gradient = torch.tensor([-5.0, 5.0]).double().repeat(4)[:, None].expand(8, net.n_rules)
+    net.accumulate(gradient, 0.9, limit=1.0)
+    assert net.traces[:, 0].tolist() == [-5, 5] * 3 + [-1, 1]
 
 
 def test_widths_stay_positive_under_adaptation():
@@ -232,6 +323,28 @@ def test_a_larger_network_can_load_a_smaller_state():
     large.load_state_dict(small.state_dict())
     x = states(5, seed=4)
     torch.testing.assert_close(large(x), small(x))
+
+
+def test_refused_rules_are_part_of_the_state():
+    net, fresh = grown(9, max_rules=5, width=0.01), network(max_rules=5, width=0.01)
+    fresh.load_state_dict(net.state_dict())
+    assert fresh.refused == net.refused == 4
+
+
+def test_a_state_cannot_be_assigned():
+    net = grown(20)
+    with pytest.raises(ValueError, match="assign=True"):
+        net.load_state_dict(net.state_dict(), assign=True)
+
+
+@pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda net: pickle.loads(pickle.dumps(net))])
+def test_a_copy_learns_in_parameters_of_its_own(duplicate):
+    net = grown(20, block_size=8)
+    before, twin = net.table().detach().clone(), duplicate(net)
+    assert torch.equal(twin.table(), before)
+    twin.clamp_consequents(0, 2, 3.0, 3.0)
+    assert (twin.table()[-2:] == 3).all()  # the joined blocks, which optimizers see
+    assert torch.equal(net.table(), before)
 
 
 def test_ordinary_optimizers_reach_the_parameters():
@@ -297,6 +410,12 @@ def test_an_empty_network_says_what_to_do():
 def test_a_rule_must_be_finite():
     with pytest.raises(ValueError, match="finite"):
         network().add_rule(torch.tensor([math.nan, 0.0, 0.0], dtype=torch.float64))
+
+
+@pytest.mark.parametrize("width", [0.0, -0.1])
+def test_the_widths_of_a_rule_must_be_positive(width):
+    with pytest.raises(ValueError, match="positive"):
+        network().add_rule(states(1)[0], torch.tensor([0.1, width, 0.5]).double())
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")

@@ -88,6 +88,37 @@ def test_a_trial_without_learning_changes_nothing_but_random_numbers(agent, expl
     assert not (explore and equal(before["rng"], after["rng"]))
 
 
+@pytest.mark.parametrize("agent", ["sga", "q"])
+def test_the_learner_is_told_that_a_trial_was_cut_off_not_that_it_ended(agent, monkeypatch):
+    learner, env = build(settings(agent))
+    told, answers, real = [], [], learner.step
+
+    def step(reward, observation, *ends):
+        told.append(ends)
+        answers.append(real(reward, observation, *ends))
+        return answers[-1]
+
+    monkeypatch.setattr(learner, "step", step)
+    record, _ = play(env, learner)
+    assert told == [(False, False)] * (record.decisions - 1) + [(False, True)]
+    assert answers[-1] is None and None not in answers[:-1]
+
+
+def test_a_trial_without_learning_is_played_by_the_frozen_policy(monkeypatch):
+    learner, env = build(settings(net={"max_rules": 1}))
+    play(env, learner)
+    explored, act = [], learner.act
+    monkeypatch.setattr(learner, "act", lambda x, explore: explored.append(explore) or act(x))
+    play(env, learner, learn=False, explore=False)
+    assert explored[:8] == [0, 0, 0, 0, 1, 3, 7, 15]  # always at the only rule
+
+
+def test_short_trials_without_the_goal_leave_the_errors_of_the_value_bounded():
+    learner, env = build(settings(seed=4, maze={"max_steps": 60}))
+    errors = [play(env, learner)[0].statistics["learning/error_rms"] for _ in range(40)]
+    assert max(errors) < 3
+
+
 # --------------------------------------------------------------------------------------- a run
 
 

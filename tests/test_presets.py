@@ -1,0 +1,106 @@
+"""The preset ``paper`` is the paper, and learners are made as the settings say."""
+
+from dataclasses import asdict
+
+import numpy as np
+import pytest
+import torch
+from conftest import settings
+
+from sofnn_torch.factory import make_agent
+from sofnn_torch.presets import preset
+from sofnn_torch.runs import flatten
+
+# Section 5, as printed; a decay of 1 is equation 6, of 0 are equations 12-15.
+PRINTED = {
+    "sga": {
+        "sga.gamma": 0.99,
+        "sga.trace_decay": 1.0,
+        "sga.rate_mean": 0.05,
+        "sga.rate_deviation": 0.001,
+        "sga.rate_centre": 0.001,
+        "sga.rate_width": 0.001,
+        "sga.one_minus_gamma": True,
+        "maze.goal_reward": 1.0,
+        "maze.collision_reward": -0.0001,
+    },
+    "q": {
+        "q.gamma": 0.99,
+        "q.trace_decay": 0.0,
+        "q.temperature": 0.05,
+        "q.rate_state": 0.1,
+        "q.rate_action": 0.1,
+        "q.rate_constant": 0.1,
+        "q.rate_centre": 0.001,
+        "q.rate_width": 0.001,
+        "maze.goal_reward": 100.0,
+        "maze.collision_reward": -0.1,
+    },
+    "both": {
+        "maze.subgoal_reward": 0.5,
+        "maze.step_reward": 0.0,
+        "maze.hold": 10,
+        "maze.max_steps": 20_000,
+        "maze.motor_noise": 0.1,
+        "net.grid": [12, 12, 8],
+        "pose": "estimated",
+    },
+}
+# Where the paper is silent: docs/paper.md.
+READ = {
+    "sga": {
+        "sga.actions": "three",
+        "sga.baseline": "constant",
+        "sga.constant": 0.0,
+        "sga.variance_scaled": False,
+        "sga.sigma_initial": 0.3,
+        "sga.value_limit": None,
+        "sga.replays": 0,
+    },
+    "q": {
+        "q.actions": "three",
+        "q.coding": "antecedent",
+        "q.segments": 3,
+        "q.trace_cut": False,
+        "q.trace_limit": None,
+        "q.value_limit": None,
+        "q.initial": 0.0,
+        "q.replays": 0,
+    },
+    "both": {
+        "net.theta": 0.5,
+        "net.growth": "rule",
+        "net.width_position": 0.06,
+        "net.width_heading": 0.45,
+        "net.grid_action": 8,
+        "maze.dead_reckoning": "literal",
+    },
+}
+
+
+@pytest.mark.parametrize("numbers", [PRINTED, READ], ids=["printed", "read"])
+@pytest.mark.parametrize("network", ["sofnn", "fixed"])
+@pytest.mark.parametrize("agent", ["sga", "q"])
+def test_the_preset_paper_has_the_numbers_of_the_paper(agent, network, numbers):
+    config = flatten(asdict(preset(agent, network, "paper")))
+    expected = numbers[agent] | numbers["both"]
+    assert {name: config[name] for name in expected} == expected
+
+
+@pytest.mark.parametrize(("agent", "rules"), [("sga", 1152), ("q", 9216)])
+def test_the_fixed_networks_have_as_many_rules_as_in_the_paper(agent, rules):
+    assert make_agent(preset(agent, "fixed", "paper")).net.n_rules == rules
+
+
+@pytest.mark.parametrize("seed", [0, 7])
+@pytest.mark.parametrize("agent", ["sga", "q"])
+def test_the_seed_of_the_settings_is_that_of_the_learner(agent, seed):
+    expected = np.random.default_rng(seed).random(4)
+    assert (make_agent(settings(agent, seed=seed)).rng.random(4) == expected).all()
+
+
+def test_an_unknown_state_keeps_its_initial_value_where_the_policy_is_interpolated():
+    net = make_agent(settings("sga", net={"interpolate": True})).net
+    net.add_rule(torch.zeros(3), consequents=torch.tensor([0.5, 0.2, 0.1]))
+    net.add_rule(torch.ones(3))
+    assert net.consequents[1].tolist() == pytest.approx([0.5, 0.2, 0.65])
