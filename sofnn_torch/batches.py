@@ -39,7 +39,8 @@ def factors(centres: Tensor, widths: Tensor, wrapping: Wrapping) -> Tensor:
     """What log firing is a product of, for each rule: 1 / v^2, u / v^2, sum u^2 / v^2.
 
     What cancels in the product is as large as the last, so they are in double precision where
-    single would leave an error above `PRECISION` at states no farther out than the centres.
+    single would leave an error above `PRECISION` at states no farther out than the centres. The
+    features must have the type of the factors.
 
     Args:
         centres: Shape: (n, K).
@@ -63,15 +64,15 @@ def log_firing(features: Tensor, factors: Tensor, wrapping: Wrapping) -> Tensor:
     """Logarithm of equation 2 from the features (B, F) of states. Shape: (B, K)."""
     rows = len(factors)  # 2 n + 1
     lengths = (rows, *[2] * len(wrapping))
-    whole, *turned = features.to(factors).split_with_sizes(lengths, 1)
+    whole, *turned = features.split_with_sizes(lengths, 1)
     if not turned:
-        return (whole @ factors).to(features.dtype)
+        return whole @ factors
     # Only where it is nearer one turn further on does a rule gain from the turn.
     gained = [
         (part @ factors[i :: rows // 2][:2]).relu_()
         for part, (i, _, _) in zip(turned, wrapping, strict=True)
     ]
-    return torch.addmm(sum(gained[1:], gained[0]), whole, factors).to(features.dtype)
+    return torch.addmm(sum(gained[1:], gained[0]), whole, factors)
 
 
 def _unwound(values: Tensor, wrapping: Wrapping) -> Tensor:

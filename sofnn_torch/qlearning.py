@@ -278,10 +278,10 @@ class QLearning:
 
     def _replay(self) -> None:
         """Equations 12-15 for batches of remembered decisions; the antecedents stay."""
-        net, firing_at = self.net, self.net.firing_function()
+        net, (features_of, firing_at) = self.net, self.net.firing_functions()
         seen = self.memory.sample(self.config.replays, self.rng, self.rates)
-        here = net.features(seen["features"][..., : net.n_inputs])
-        there = net.features(self._inputs(seen["following"]))
+        here = features_of(seen["features"][..., : net.n_inputs])
+        there = features_of(self._inputs(seen["following"]))
         for x, ahead, *row in zip(here, there, *seen.values(), strict=True):
             features, reward, goes_on, following = row
             best = self.action_values(following, firing_at(ahead)).amax(-1)

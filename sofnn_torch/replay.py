@@ -64,7 +64,7 @@ class ReplayMemory:
             ValueError: the state is of a memory of another size.
         """
         rows, count = state["rows"], state["count"]
-        if count < 0 or rows.shape != (min(count, len(self.rows)), self.rows.shape[1]):
+        if rows.shape != (min(count, len(self.rows)), self.rows.shape[1]):
             raise ValueError(
                 f"{count} decisions of shape {tuple(rows.shape)} do not fit the memory"
             )

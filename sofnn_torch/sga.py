@@ -271,9 +271,9 @@ class SGA:
         Another policy took them: each counts min(1, pi(a | x) now / then) (Wawrzynski, Neural
         Networks 22, 2009; Espeholt et al., ICML 2018).
         """
-        net, firing_at = self.net, self.net.firing_function()
+        net, (features, firing_at) = self.net, self.net.firing_functions()
         seen = self.memory.sample(self.config.replays, self.rng, self.rates)
-        here, there = net.features(seen.pop("state")), net.features(seen.pop("following"))
+        here, there = features(seen.pop("state")), features(seen.pop("following"))
         for x, following, *row in zip(here, there, *seen.values(), strict=True):
             action, then, reward, goes_on = row
             firing = firing_at(x)

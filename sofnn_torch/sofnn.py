@@ -134,26 +134,30 @@ class SOFNN(RuleTable):
         centres, widths = antecedents or self.table().split_with_sizes(self.parts)[:2]
         if x.dim() == 2 and len(x) >= batches.LARGE:
             factors = batches.factors(centres, widths, self.wrapping)
-            return batches.log_firing(self.features(x), factors, self.wrapping).softmax(-1)
+            features = batches.features(x.to(factors), self.wrapping)
+            return batches.log_firing(features, factors, self.wrapping).softmax(-1).to(x)
         return (-0.5 * self._squares(x, centres, widths).sum(-2)).softmax(-1)
 
-    def firing_function(self) -> Callable[[Tensor], Tensor]:
-        """The normalised firing as a function of `features` (.., F), while the antecedents stay.
+    def firing_functions(self) -> tuple[Callable[[Tensor], Tensor], Callable[[Tensor], Tensor]]:
+        """The normalised firing in two steps, while the antecedents stay.
 
         What depends on the antecedents alone is computed once, without a gradient.
+
+        Returns:
+            A function from states (.., n) to their features (.., F), and one from features to the
+            normalised firing (.., K).
         """
         factors = batches.factors(self._centres, self._widths, self.wrapping)
+
+        def features(x: Tensor) -> Tensor:
+            return batches.features(x.to(factors), self.wrapping)
 
         def firing(features: Tensor) -> Tensor:
             flat = features.reshape(-1, features.shape[-1])
             log_firing = batches.log_firing(flat, factors, self.wrapping)
-            return log_firing.softmax(-1).reshape(*features.shape[:-1], -1)
+            return log_firing.softmax(-1).to(self._centres).reshape(*features.shape[:-1], -1)
 
-        return firing
-
-    def features(self, x: Tensor) -> Tensor:
-        """What `firing_function` takes, from states x (.., n). Shape: (.., F)."""
-        return batches.features(x, self.wrapping)
+        return features, firing
 
     def forward(self, x: Tensor) -> Tensor:
         """Weighted mean of the consequents (eqs 4, 10) for x of shape (B, n). Shape: (B, m)."""

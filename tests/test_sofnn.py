@@ -94,7 +94,7 @@ def test_a_batch_in_one_product_is_as_exact_as_differences(dtype):
     exact = net.log_memberships(states(64, seed=2)).sum(1)
     centres, widths, _ = (t.to(dtype) for t in net.table().split_with_sizes(net.parts))
     factors = batches.factors(centres, widths, net.wrapping)
-    features = net.features(states(64, seed=2).to(dtype))
+    features = batches.features(states(64, seed=2).to(factors), net.wrapping)
     product = batches.log_firing(features, factors, net.wrapping)
     precision = 3e4 * torch.finfo(dtype).eps  # (u / v)^2 is up to 1e4
     near = exact > -50  # the others never fire
@@ -104,14 +104,17 @@ def test_a_batch_in_one_product_is_as_exact_as_differences(dtype):
 
 def test_factors_are_double_where_single_precision_would_not_do():
     generator = torch.Generator().manual_seed(0)
-    centres = 10 * torch.rand(3, 50, generator=generator)
-    widths = torch.full_like(centres, 0.01)  # (u / v)^2 is up to 1e6
-    x = centres.T + 0.01 * torch.randn(50, 3, generator=generator)
+    centres = 10 + 0.01 * torch.randn(3, 50, generator=generator)
+    widths = 0.01 + 0.01 * torch.rand(3, 50, generator=generator)  # (u / v)^2 is up to 1e6
+    x = 10 + 0.01 * torch.randn(50, 3, generator=generator)
     exact = -0.5 * ((x.double().unsqueeze(-1) - centres.double()) / widths.double()) ** 2
-    features = batches.features(x.double(), ())
-    product = batches.log_firing(features, batches.factors(centres, widths, ()), ())
-    error = (product - exact.sum(1)).diagonal().abs().max()
-    assert error < batches.PRECISION
+    net = SOFNN(3, 1, width=0.01)
+    for centre, width in zip(centres.T, widths.T, strict=True):
+        net.add_rule(centre, width)
+    expected = exact.sum(1).softmax(1).float()
+    torch.testing.assert_close(net.normalised_firing(x), expected, rtol=0, atol=batches.PRECISION)
+    features, firing = net.firing_functions()
+    torch.testing.assert_close(firing(features(x)), expected, rtol=0, atol=batches.PRECISION)
     assert batches.factors(centres, torch.ones_like(widths), ()).dtype == torch.float32
 
 
