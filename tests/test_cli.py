@@ -197,6 +197,9 @@ def test_growth_without_end_stops_at_the_limit_and_says_so(agent, here, capsys):
         ("--trials -3", "--trials must be positive, got -3"),
         ("--trials 0", "--trials must be positive"),
         ("--seed -1", "--seed must not be negative"),
+        ("--seed 9223372036854775808", "--seed must lie between -2**63 and 2**63"),
+        ("--maze.max-steps 99999999999999999999", "--maze.max-steps must lie between -2**63"),
+        ("--seeds 0,9223372036854775808", "--seed must lie between -2**63 and 2**63"),
         ("--net.theta 0", "--net.theta must lie between 0 and 1"),
         ("--net.theta 1", "--net.theta must lie between 0 and 1"),
         ("--net.theta nan", "--net.theta must be a finite number"),
@@ -232,7 +235,7 @@ def test_growth_without_end_stops_at_the_limit_and_says_so(agent, here, capsys):
         ("--resume nowhere", "not a run directory"),
         ("--replay nowhere", "cannot be read"),
         ("--runs /dev/null", "cannot be used"),
-        ("--trials " + "9" * 400, "--trials must be a finite number"),
+        ("--trials " + "9" * 400, "--trials must lie between -2**63 and 2**63"),
     ],
 )
 def test_bad_flags_get_one_clear_line_and_leave_nothing(words, message, here, capsys):
@@ -421,3 +424,8 @@ def test_any_arguments_are_parsed_or_refused_in_one_line(arguments):
 def test_a_config_survives_its_file(tmp_path):
     config = short("q", "fixed", q={"trace_limit": None}, net={"grid": (3, 5, 7)}, trials=1)
     assert load_config(training.train(config, quick_options(tmp_path))) == config
+
+
+def test_the_largest_seed_can_be_read_again():
+    config = Config(seed=2**63 - 1)
+    assert from_dict(json.loads(config.to_json())) == config
