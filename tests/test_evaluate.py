@@ -3,7 +3,9 @@
 import dataclasses
 import json
 import math
+import runpy
 from dataclasses import replace
+from pathlib import Path
 
 import imageio.v3 as imageio
 import numpy as np
@@ -145,7 +147,7 @@ def test_video_shows_the_maze(trained, tmp_path):
     ("arguments", "message"),
     [
         (["nowhere"], "not a run directory"),
-        ([], "RUN"),
+        ([], "RUN is missing: Directory of the run."),
         (["RUN", "--epsodes", "3"], "did you mean --episodes?"),
         (["RUN", "--episodes", "many"], "--episodes"),
         (["RUN", "--episodes", "0"], "--episodes must be at least 1"),
@@ -164,6 +166,19 @@ def test_bad_input_gives_one_line_and_exit_code_2(
     (line,) = capsys.readouterr().err.strip().splitlines()
     assert line.startswith("error: ")
     assert message in line
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"), [([], "RUN is missing"), (["nowhere"], "not a run directory")]
+)
+def test_the_pictures_of_the_readme_need_a_run(monkeypatch, capsys, arguments, message):
+    file = Path(__file__).parents[1] / "docs" / "make_images.py"
+    monkeypatch.setattr("sys.argv", [file.name, *arguments])
+    with pytest.raises(SystemExit) as stop:
+        runpy.run_path(str(file), run_name="__main__")
+    assert stop.value.code == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("error: ") and message in line
 
 
 def test_a_checkpoint_of_other_settings_is_refused(trained, tmp_path, monkeypatch, capsys):

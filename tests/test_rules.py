@@ -443,7 +443,7 @@ def test_files_are_the_same_every_time(run, tmp_path, call):
         (["RUN", "--tpo", "3"], "did you mean --top?"),
         (["RUN", "--top", "-1"], "--top must not be negative"),
         (["RUN", "--seed", "-1"], "--seed must not be negative"),
-        (["RUN", "--at", "0.1", "0.1"], "--at"),
+        (["RUN", "--at", "0.1", "0.1"], "--at must be FLOAT FLOAT FLOAT or None, got ['0.1', '"),
         (["RUN", "--at", "0.1", "nan", "0"], "--at needs three finite numbers"),
         (["RUN", "--at", "inf", "0.1", "0"], "--at needs three finite numbers"),
         (["RUN", "--json", "rules.csv"], "--json must end in .json"),
