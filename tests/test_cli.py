@@ -126,6 +126,15 @@ def test_a_reader_that_leaves_early_is_no_error(here):
     assert child.wait(timeout=120) == 0
 
 
+def test_a_bad_mujoco_gl_is_one_line(here):
+    command = [sys.executable, str(ROOT / "train.py"), "--trials", "1"]
+    environment = os.environ | {"MUJOCO_GL": "nonsense"}
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=120)
+    assert done.returncode == 2 and not contents(here)
+    (line,) = done.stderr.splitlines()
+    assert "MUJOCO_GL=nonsense" in line and "egl, osmesa or glfw" in line
+
+
 def test_what_an_encoding_lacks_prints_as_question_marks(monkeypatch):
     buffer = io.BytesIO()
     monkeypatch.setattr("sys.stdout", io.TextIOWrapper(buffer, encoding="ascii"))
