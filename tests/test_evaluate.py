@@ -101,7 +101,7 @@ def test_the_command_prints_a_table_and_leaves_the_run_alone(
         results.append(file.read_text())
     assert results[0] == results[1]  # the same seed, the same trials
     table = capsys.readouterr().out
-    assert "2 trials learned" in table
+    assert "2 trials learned" in table and f"written: {file}" in table
     assert "over the kinematic optimum" in table
     data = json.loads(results[0])
     assert [trial["trial"] for trial in data["trials"]] == [1, 2, 3]
@@ -128,7 +128,23 @@ def test_a_damaged_checkpoint_is_named_and_the_one_before_is_taken(trained, tmp_
     newest.write_bytes(newest.read_bytes()[:-10])
     with pytest.raises(ValueError, match="no rule"):
         evaluate.load(copy)  # what is left has learned nothing
-    assert "checkpoint-2.pt: damaged" in capsys.readouterr().err
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "checkpoint-2.pt: damaged" in line and "use an earlier" not in line
+    assert line.endswith("; checkpoint-0.pt is used instead")
+
+
+def test_a_checkpoint_file_stands_for_its_run(trained, tmp_path, monkeypatch, capsys):
+    file = trained / "checkpoint-2.pt"
+    lone = tmp_path / "lone.pt"
+    lone.write_bytes(file.read_bytes())
+    for path in (trained, file, lone):
+        config, agent, used, state = evaluate.load(path)
+        assert config.maze.max_steps == 120 and state["trial"] == 2 and agent.net.n_rules
+        assert used == (file if path == trained else path)
+    assert call(monkeypatch, lone, "--episodes", "1") == 0
+    assert f"{lone}: 2 trials learned" in capsys.readouterr().out
+    assert call(monkeypatch, lone, "--best") == 2
+    assert "--best chooses a checkpoint of a run directory" in capsys.readouterr().err
 
 
 def test_video_shows_the_maze(trained, tmp_path):
@@ -147,7 +163,7 @@ def test_video_shows_the_maze(trained, tmp_path):
     ("arguments", "message"),
     [
         (["nowhere"], "not a run directory"),
-        ([], "RUN is missing: Directory of the run."),
+        ([], "RUN is missing: Directory of the run, "),
         (["RUN", "--epsodes", "3"], "did you mean --episodes?"),
         (["RUN", "--episodes", "many"], "--episodes"),
         (["RUN", "--episodes", "0"], "--episodes must be at least 1"),
@@ -189,7 +205,8 @@ def test_a_checkpoint_of_other_settings_is_refused(trained, tmp_path, monkeypatc
     settings["config"]["net"]["theta"] = 0.7
     (copy / "config.json").write_text(json.dumps(settings))
     assert call(monkeypatch, copy) == 2
-    assert "net.theta" in capsys.readouterr().err
+    line = capsys.readouterr().err
+    assert "net.theta" in line and "train anew" not in line
 
 
 @pytest.mark.parametrize(
