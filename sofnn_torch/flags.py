@@ -89,8 +89,8 @@ def _program() -> str:
     module = sys.modules["__main__"].__spec__
     if module:
         return f"python -m {module.name.removesuffix('.__main__')}"
-    name = Path(sys.argv[0]).name
-    return f"python {name}" if name.endswith(".py") else name
+    path = sys.argv[0]
+    return f"python {path}" if path.endswith(".py") else Path(path).name
 
 
 def _first_message(framed: str) -> str:

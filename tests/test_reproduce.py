@@ -55,6 +55,9 @@ def test_every_arm_is_a_set_of_valid_settings(study, arm):
     reference = {"section5", "paper", "robustness"}
     own = set(entries) - {"agent", "network", "preset", "pose"}
     assert bool(own) != (study in reference or arm.endswith("-default"))
+    start = {name: entries[name] for name in ("agent", "network", "preset") if name in entries}
+    flags = (cli.Flags(settings(part), cli.RunOptions()) for part in (entries, start))
+    cli._refuse_idle(*flags)  # a page of results shows no flag that train.py would refuse
 
 
 def test_a_factor_follows_the_preset():
