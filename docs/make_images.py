@@ -1,11 +1,15 @@
 """Make the pictures of the README from a run: python docs/make_images.py RUN."""
 
-import sys
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
+
+import tyro
 
 from sofnn_torch import figures
 from sofnn_torch.evaluate import load
 from sofnn_torch.factory import make_env
+from sofnn_torch.flags import command
 from sofnn_torch.physics import load_model
 from sofnn_torch.policy import FrozenPolicy
 from sofnn_torch.rendering import OffscreenRenderer
@@ -14,9 +18,17 @@ OUT = Path(__file__).parent / "images"
 SIZE = 840  # pixels of a rendered picture
 
 
-def main(run: Path) -> None:
+@dataclass(frozen=True)
+class Options:
     """Play one trial and draw the robot, its path and its policy."""
-    config, agent, _, _ = load(run)
+
+    run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    """Directory of the run."""
+
+
+def main(options: Options) -> None:
+    """Play one trial and draw the robot, its path and its policy."""
+    config, agent, _, _ = load(options.run)
     env = make_env(config)
     renderer = OffscreenRenderer(load_model(), SIZE, SIZE)
     trail: list[tuple[float, float]] = []
@@ -42,4 +54,4 @@ def main(run: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    command(main, Options, __doc__)

@@ -25,6 +25,7 @@ VERSION = 1
 HEADER = re.compile(rb"sofnn-torch checkpoint (\d{1,9}) ([0-9a-f]{64})\n")
 HEADER_SIZE = 200  # no header line is longer
 NAME = re.compile(r"checkpoint-(\d+)\.pt")
+ADVICE = "; use an earlier checkpoint"
 KINDS = {
     "config": dict,
     "trial": int,
@@ -69,9 +70,7 @@ def load(path: Path) -> dict[str, Any]:
         raise CheckpointError(f"{path}: not a checkpoint of sofnn-torch")
     version, payload = int(header[1]), data[header.end() :]
     if header[2] != _digest(version, payload):
-        raise CheckpointError(
-            f"{path}: damaged or cut off (its checksum differs); use an earlier checkpoint"
-        )
+        raise CheckpointError(f"{path}: damaged or cut off (its checksum differs){ADVICE}")
     if version > VERSION:
         raise CheckpointError(
             f"{path}: format {version}, this program reads up to {VERSION}; update sofnn-torch"
@@ -180,9 +179,9 @@ def find_latest(
                 check(path, state)
             return path, state, problems
         except CheckpointError as error:
-            problems.append(str(error))
-    reason = f" ({problems[0]})" if problems else ""
-    raise CheckpointError(f"{directory}: no checkpoint to go on from{reason}; train anew")
+            problems.append(str(error).removesuffix(ADVICE))
+    reason = f" ({problems[0]})" if problems else "; train anew"
+    raise CheckpointError(f"{directory}: no checkpoint to go on from{reason}")
 
 
 def write_atomically(path: Path, data: bytes) -> None:

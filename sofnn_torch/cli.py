@@ -11,7 +11,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
@@ -20,10 +20,11 @@ if __name__ == "__main__":  # Ctrl-C while libraries load: there is nothing to s
 
 from sofnn_torch import runs, seeds, training
 from sofnn_torch.config import Config
+from sofnn_torch.flags import output
 from sofnn_torch.flags import parse as parse_flags
 from sofnn_torch.guard import Divergence, Interrupted
 from sofnn_torch.presets import preset
-from sofnn_torch.session import RunOptions, saved_config
+from sofnn_torch.session import RunOptions, home_of, saved_config
 
 EXAMPLES = """Train a robot to find its way with a self-organizing fuzzy neural network.
 
@@ -58,16 +59,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Train as the flags say; the exit code."""
     argv = list(sys.argv[1:] if argv is None else argv)
     try:
-        flags = parse(argv)
-        if flags.replay:
-            training.replay(flags.replay)
-        elif flags.seeds is not None:
-            return seeds.train(flags.config, flags.options, flags.seeds, flags.workers, argv)
-        elif flags.resume:
-            run = training.resume(flags.resume, flags.options, flags.config.trials)
-            print(f"{run}: done")
-        else:
-            print(f"{training.train(flags.config, flags.options)}: done")
+        with output():
+            flags = parse(argv)
+            if flags.replay:
+                training.replay(flags.replay)
+            elif flags.seeds is not None:
+                return seeds.train(flags.config, flags.options, flags.seeds, flags.workers, argv)
+            elif flags.resume:
+                run = training.resume(flags.resume, flags.options, flags.config.trials)
+                print(f"{run}: done")
+            else:
+                print(f"{training.train(flags.config, flags.options)}: done")
     except ValueError as error:
         return _fail(error, 2)
     except (Divergence, OSError) as error:
@@ -95,13 +97,11 @@ def parse(argv: Sequence[str]) -> Flags:
         base = saved_config(known.resume)
     else:
         base = _preset(known)
-    flags = parse_flags(Flags, argv, EXAMPLES, Flags(config=base, options=RunOptions()))
+    unchanged = Flags(config=base, options=RunOptions())
+    flags = parse_flags(Flags, argv, EXAMPLES, unchanged)
     if flags.resume:
         _keep_settings(flags, base)
-    for agent in {"sga", "q"} - {flags.config.agent}:
-        if changed := _difference(getattr(flags.config, agent), getattr(base, agent)):
-            flag = _flag(f"{agent}.{changed}")
-            raise ValueError(f"{flag} has no effect with --agent {flags.config.agent}")
+    _refuse_idle(flags, unchanged)
     if flags.seeds is not None and flags.config.seed != base.seed:
         raise ValueError("--seed and --seeds exclude each other")
     if flags.workers < 1:
@@ -115,19 +115,21 @@ class _Parser(argparse.ArgumentParser):
 
 
 def _preset(known: argparse.Namespace) -> Config:
-    if known.network not in ("sofnn", "fixed"):
-        raise ValueError(f"--network must be sofnn or fixed, got {known.network!r}")
-    return preset(known.agent, known.network, known.preset)
+    try:
+        return preset(known.agent, known.network, known.preset)
+    except ValueError:
+        return Config()  # no such preset: all flags are checked next
 
 
 def _keep_settings(flags: Flags, base: Config) -> None:
     """Refuse flags that contradict the run to resume."""
     if flags.seeds is not None or flags.replay:
         raise ValueError("--resume goes with neither --seeds nor --replay")
-    if flags.resume.is_dir() and flags.options.name is not None:
-        raise ValueError("--name is for new runs; a resumed run keeps its directory")
+    moved = {"name", "runs"} & set(_changes(flags.options, RunOptions()))
+    if moved and home_of(flags.resume):
+        raise ValueError(f"--{min(moved)} is for new runs; a resumed run keeps its directory")
     asked = dataclasses.replace(flags.config, trials=base.trials)
-    if name := _difference(asked, base):
+    for name in _changes(asked, base):
         ours, theirs = (runs.flatten(dataclasses.asdict(c))[name] for c in (asked, base))
         raise ValueError(
             f"{_flag(name)} {ours} contradicts {flags.resume}, which has {theirs}: "
@@ -135,10 +137,36 @@ def _keep_settings(flags: Flags, base: Config) -> None:
         )
 
 
-def _difference(ours, theirs) -> str | None:
-    """Name of the first setting that differs."""
+def _refuse_idle(flags: Flags, base: Flags) -> None:
+    """Refuse flags that change nothing, given the others."""
+    alone = Flags(Config(), RunOptions(), replay=flags.replay)
+    if flags.replay and (others := _changes(flags, alone)):
+        raise ValueError(f"{_flag(others[0])} has no effect with --replay")
+    config, sga, q = flags.config, flags.config.sga, flags.config.q
+    action = config.agent == "q" and q.coding == "antecedent"
+    rules = (  # when, which settings or tables of settings, why
+        (config.agent != "sga", "sga", "with --agent q"),
+        (config.agent != "q", "q", "with --agent sga"),
+        (config.network == "fixed", "net.theta net.growth net.interpolate", "with --network fixed"),
+        (config.network != "fixed", "net.grid net.grid_action", "without --network fixed"),
+        (not action, "net.grid_action net.width_action", "without --q.coding antecedent"),
+        (sga.baseline == "value", "sga.constant", "with --sga.baseline value"),
+        (sga.baseline != "value", "sga.rate_value sga.initial_value", "without a learned baseline"),
+        (not sga.replays, "sga.memory", "with --sga.replays 0"),
+        (not q.replays, "q.memory", "with --q.replays 0"),
+        (flags.seeds is None, "workers", "without --seeds"),
+    )
+    for name in _changes(flags, base):
+        for idle, names, why in rules:
+            if idle and {name, name.partition(".")[0]} & set(names.split()):
+                raise ValueError(f"{_flag(name)} has no effect {why}")
+
+
+def _changes(ours: Any, theirs: Any) -> list[str]:
+    """Names of the settings that differ."""
     a, b = (runs.flatten(dataclasses.asdict(settings)) for settings in (ours, theirs))
-    return next((name for name in a if a[name] != b[name]), None)
+    changed = [name for name in a if a[name] != b[name]]
+    return [name.removeprefix("config.").removeprefix("options.") for name in changed]
 
 
 def _flag(name: str) -> str:

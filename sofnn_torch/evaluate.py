@@ -32,8 +32,8 @@ from sofnn_torch.factory import Agent, make_agent, make_env
 from sofnn_torch.flags import command
 from sofnn_torch.monitoring import TrialRecord, film, gif
 from sofnn_torch.optimum import optimal_steps
-from sofnn_torch.runs import load_config, same_settings, say, versions
-from sofnn_torch.session import arithmetic
+from sofnn_torch.runs import plural, same_settings, say, versions
+from sofnn_torch.session import arithmetic, saved_config
 from sofnn_torch.training import play
 
 CONFIDENCE = 0.95
@@ -44,7 +44,7 @@ class Options:
     """Play the learned policy of a run and print steps, success, collisions and pose error."""
 
     run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
-    """Directory of the run."""
+    """Directory of the run, or one of its checkpoint files."""
     episodes: int = 10
     """Trials to play."""
     explore: bool = False
@@ -90,17 +90,23 @@ def check(options: Options) -> None:
 def load(run: Path, best: bool = False) -> tuple[Config, Agent, Path, dict[str, Any]]:
     """Settings, learner, file and state of the latest good checkpoint of a run, or of its best.
 
+    Args:
+        run: a run directory, or one checkpoint file.
+        best: take the best checkpoint of the directory.
+
     Raises:
-        ValueError: not a run, or no checkpoint that fits it.
+        ValueError: neither of them, or no checkpoint that fits its settings.
     """
-    config = load_config(run)
-    if best:
-        path = run / "best.pt"
+    config = saved_config(run)
+    if best and run.is_file():
+        raise ValueError(f"--best chooses a checkpoint of a run directory, and {run} is a file")
+    if best or run.is_file():
+        path = run / "best.pt" if best else run
         state = checkpoint.load(path)
     else:
         path, state, problems = checkpoint.find_latest(run)
         for problem in problems:
-            say(f"warning: {problem}")
+            say(f"warning: {problem}; {path.name} is used instead")
     same_settings(path, state, config)
     agent, env = make_agent(config), make_env(config)
     checkpoint.restore(path, state, agent, env)
@@ -252,8 +258,9 @@ def run(options: Options) -> dict[str, Estimate]:
     env = make_env(config)
     rows = summarise(records, optimal_steps(env.unwrapped.plan, config.maze.hold).steps)
     env.close()
-    print(f"{path}: {state['trial']} trials learned, {agent.net.n_rules} rules")
-    print(f"{options.episodes} trials with {policy} actions:")
+    learned = f"{plural(state['trial'], 'trial')} learned, {plural(agent.net.n_rules, 'rule')}"
+    print(f"{path}: {learned}")
+    print(f"{plural(options.episodes, 'trial')} with {policy} actions:")
     Console().print(table(rows))
     if options.json:
         results = {
@@ -269,8 +276,10 @@ def run(options: Options) -> dict[str, Estimate]:
             "versions": versions(),
         }
         options.json.write_text(json.dumps(results, indent=2) + "\n")
+        print(f"written: {options.json}")
     if options.video:
         write_video(options.video, config, agent, options.seed, options.explore)
+        print(f"written: {options.video}")
     return rows
 
 

@@ -2,12 +2,29 @@
 
 import contextlib
 import io
+import os
 import re
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
 import tyro
+
+# What tyro says, and how it is said here; the first that fits.
+PLAIN = {
+    r"Missing value for argument '(.+)'\. Expected 1 values\.": r"\1 needs a value",
+    r"Missing value for argument '(.+)'\. Expected (\d+) values\.": r"\1 needs \2 values",
+    r"Missing from .+?: (\S+) (.+) \(required\)": r"\1 is missing: \2",
+    r"invalid choice (.+) for argument '(.+)'\. .+\((.+)\)\.": r"\2 must be one of \3, got \1",
+    r"Error parsing (\S+): .+ \{None\}\|\{?(.+?)\}? could .+? from (\[.*?\])\..*": (
+        r"\1 must be \2 or None, got \3"
+    ),
+    r"Error parsing (\S+): .+ for int\(\) .+?: (.+)": r"\1 must be a whole number, got \2",
+    r"Error parsing (\S+): .+ to float: (.+)": r"\1 must be a number, got \2",
+    r"Error parsing (\S+): .+? \[(.+)\] into tuple .+\[(.+)\]": r"\1 must be \3, got \2",
+    r"Error parsing \w+: (--.+)": r"\1",  # said by a check of the settings
+}
 
 
 def parse(kind: Any, argv: Sequence[str], description: str, default: Any = None) -> Any:
@@ -27,7 +44,7 @@ def parse(kind: Any, argv: Sequence[str], description: str, default: Any = None)
     settings = {} if default is None else {"default": default}
     try:
         with contextlib.redirect_stderr(messages):
-            return tyro.cli(kind, args=argv, description=description, **settings)
+            return tyro.cli(kind, args=argv, prog=_program(), description=description, **settings)
     except SystemExit as stop:
         if not stop.code:
             raise
@@ -46,10 +63,34 @@ def command(action: Callable[[Any], Any], kind: Any, description: str) -> None:
         SystemExit: with code 2 after an error that a user can do something about.
     """
     try:
-        action(parse(kind, sys.argv[1:], description))
+        with output():
+            action(parse(kind, sys.argv[1:], description))
     except (ValueError, OSError, RuntimeError, ArithmeticError) as error:
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
         sys.exit(2)
+
+
+@contextlib.contextmanager
+def output() -> Iterator[None]:
+    """Inside, what the encoding lacks prints as ``?``, and a reader that leaves is no error."""
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")
+    try:
+        try:
+            yield
+        finally:
+            print(end="", flush=True)
+    except BrokenPipeError:  # whoever read has enough; Python must not try again on exit
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _program() -> str:
+    """What was called, as the help shows it: a module, a file or an installed command."""
+    module = sys.modules["__main__"].__spec__
+    if module:
+        return f"python -m {module.name.removesuffix('.__main__')}"
+    path = sys.argv[0]
+    return f"python {path}" if path.endswith(".py") else Path(path).name
 
 
 def _first_message(framed: str) -> str:
@@ -65,5 +106,8 @@ def _first_message(framed: str) -> str:
         lines = lines[1:]
     end = next((i for i, line in enumerate(lines) if not line.strip("-─")), len(lines))
     what = " ".join(lines[:end])
+    for said, plain in PLAIN.items():
+        if found := re.fullmatch(said, what):
+            return found.expand(plain)
     hint = next((m[1] for line in lines[end:] if (m := re.match(r"(--\w[\w.-]*)", line))), None)
     return f"{what}; did you mean {hint}?" if hint and "nrecognized" in what else what

@@ -80,7 +80,8 @@ def diagnose(agent: Agent, observation: np.ndarray) -> str:
         if bad.any():
             rule = int(bad.nonzero()[0])
             worst = ", ".join(f"{value:.3g}" for value in values[rule].tolist())
-            return f"{name} of {int(bad.sum())} of {net.n_rules} rules, as in rule {rule}: {worst}"
+            count = f"{int(bad.sum())} of {net.n_rules} rules"
+            return f"{name} of {count}, as in rule {rule + 1}: {worst}"
     return ""
 
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from sofnn_torch.flags import command
 from sofnn_torch.odometry import Pose
 from sofnn_torch.physics import MazePlan, Physics
 
@@ -127,7 +128,12 @@ def _trace_back(levels: list, index: int, last: int, start_heading: float, hold:
     )
 
 
-def main() -> None:
+@dataclass(frozen=True)
+class Options:
+    """There are no flags."""
+
+
+def run(_: Options) -> None:
     """Print the optimum of the standard maze at two resolutions."""
     plan = Physics().plan
     for hold, resolution in ((10, 0.0025), (10, 0.00125), (1, 0.0025), (1, 0.00125)):
@@ -136,6 +142,11 @@ def main() -> None:
             f"actions held {hold:2d} steps, cells of {resolution * 1e3} mm: "
             f"{best.steps} steps, {len(best.actions)} decisions"
         )
+
+
+def main() -> None:
+    """Entry point of ``python -m sofnn_torch.optimum``."""
+    command(run, Options, __doc__)
 
 
 if __name__ == "__main__":

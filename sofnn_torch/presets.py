@@ -11,8 +11,9 @@ def preset(agent: str, network: str, name: str) -> Config:
     Raises:
         ValueError: an unknown name.
     """
-    if name not in ("default", "paper") or agent not in ("sga", "q"):
-        raise ValueError(f"no preset {name!r} for agent {agent!r}")
+    known = name in ("default", "paper") and agent in ("sga", "q")
+    if not known or network not in ("sofnn", "fixed"):
+        raise ValueError(f"no preset {name!r} for agent {agent!r} and network {network!r}")
     if name == "paper":
         return _paper(agent, network)
     net = NetworkConfig()

@@ -30,8 +30,8 @@ from sofnn_torch.evaluate import load
 from sofnn_torch.explain import Decision, Reading, number
 from sofnn_torch.factory import Agent, make_env
 from sofnn_torch.flags import command
-from sofnn_torch.runs import Run, first_free
-from sofnn_torch.session import RunOptions, arithmetic
+from sofnn_torch.runs import Run, first_free, plural, say
+from sofnn_torch.session import RunOptions, arithmetic, home_of
 from sofnn_torch.survey import usage
 from sofnn_torch.training import play
 
@@ -46,7 +46,7 @@ class Options:
     """Print the learned rules of a run as a table, the most used first; write, edit, explain."""
 
     run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
-    """Directory of the run."""
+    """Directory of the run, or one of its checkpoint files."""
     top: int = 20
     """Rules in the table; 0 for all."""
     at: tuple[float, float, float] | None = None
@@ -109,12 +109,14 @@ def summary(shares: NDArray[Any], decisions: int, reading: Reading) -> str:
     total = np.sort(shares)[::-1].cumsum()
     half, most = (1 + int((total < share * total[-1]).sum()) for share in (0.5, 0.9))
     idle = int((shares * decisions < FIRED).sum())
-    text = f"{len(shares):,} rules: {half:,} make up 50 % of the firing along the trial, "
+    text = f"{plural(len(shares), 'rule')}: {half:,} make up 50 % of the firing along the trial, "
     text += f"{most:,} make up 90 %, {idle:,} took no part"
-    if outvoted := int(reading.outvoted.sum()):
+    outvoted = int(reading.outvoted.sum())
+    if outvoted == 1:
+        text += "\n1 rule (*) is outvoted: where it is centred, all rules "
+    elif outvoted:
         text += f"\n{outvoted:,} rules (*) are outvoted: where they are centred, all rules "
-        text += "together choose another action"
-    return text
+    return text + "together choose another action" * bool(outvoted)
 
 
 def table(reading: Reading, shares: NDArray[Any], top: int) -> Table:
@@ -175,6 +177,15 @@ def show(view: Table) -> None:
     (console if console.is_terminal else Console(width=WIDTH)).print(view)
 
 
+def warn_outside(config: Config, x: float, y: float) -> None:
+    """Say it if a position [m] is not in the maze: the rules answer everywhere."""
+    env = make_env(config)
+    width, height = env.unwrapped.plan.size
+    env.close()
+    if not (0 <= x <= width and 0 <= y <= height):
+        say(f"warning: --at {x:g} {y:g} is outside the maze of {width:g} x {height:g} m")
+
+
 def edit(options: Options, config: Config, agent: Agent, path: Path, state: dict[str, Any]) -> Path:
     """Make a run with other rules and the rest of a state; its directory.
 
@@ -187,15 +198,18 @@ def edit(options: Options, config: Config, agent: Agent, path: Path, state: dict
     # The best and the last ten trials were those of other rules.
     state = state | {"network": checkpoint.describe(agent.net), "recent": [], "best": []}
     state["agent"] = state["agent"] | {"net": agent.net.state_dict()}
-    home = options.run if options.run.name not in ("", "..") else options.run.resolve()
+    home = home_of(options.run)
+    if home is None:
+        raise ValueError(f"{options.run}: --load needs a run directory or a checkpoint in one")
+    home = home if home.name not in ("", "..") else home.resolve()
     name = options.name or first_free(home.with_name(f"{home.name}-edited")).name
-    before = json.loads((options.run / "config.json").read_bytes())
+    before = json.loads((home / "config.json").read_bytes())
     session = {"versions": before.get("versions"), "commit": before.get("commit")}
     session["edited"] = {"checkpoint": str(path), "rules": str(options.load)}
     earlier = [*before.get("earlier", []), session]
     run = Run.create(home.parent, name, config, RunOptions.keep, earlier)
     try:
-        if (trials := options.run / "trials.csv").exists():
+        if (trials := home / "trials.csv").exists():
             shutil.copyfile(trials, run.path / "trials.csv")
         run.rewind(state)
     except BaseException:
@@ -241,12 +255,14 @@ def run(options: Options) -> None:
     config, agent, path, state = load(options.run)
     if options.load:
         new, rules = edit(options, config, agent, path, state), agent.net.n_rules
-        print(f"{new}: {rules:,} rules from {options.load}, the rest from {path}")
+        print(f"{new}: {plural(rules, 'rule')} from {options.load}, the rest from {path}")
         return
-    print(f"{path}: {state['trial']} trials learned, {agent.net.n_rules:,} rules")
+    learned = f"{plural(state['trial'], 'trial')} learned, {plural(agent.net.n_rules, 'rule')}"
+    print(f"{path}: {learned}")
     reading = explain.read(agent)
     if options.at:
         x, y, degrees = options.at
+        warn_outside(config, x, y)
         heading = math.remainder(math.radians(degrees), 2 * math.pi)
         decision = explain.decide(agent, np.array([x, y, heading], np.float32))
         print(f"at x {1000 * x:.0f} mm, y {1000 * y:.0f} mm, heading {explain.bearing(heading)}:")
@@ -257,8 +273,12 @@ def run(options: Options) -> None:
     shares, decisions, outcome = firing_along_a_trial(config, agent, options.seed)
     print(f"one trial without learning or exploration, seed {options.seed}: {outcome}")
     print(summary(shares, decisions, reading))
-    show(table(reading, shares, options.top))
+    files = [path for path in (options.json, options.csv, options.picture) if path]
+    if not files:
+        show(table(reading, shares, options.top))
     write(options, config, agent, reading, shares)
+    for file in files:
+        print(f"written: {file}")
 
 
 def main() -> None:

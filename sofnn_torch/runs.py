@@ -34,6 +34,11 @@ def say(text: str) -> None:
     tqdm.write(text, file=sys.stderr)
 
 
+def plural(number: int, thing: str) -> str:
+    """A number of things, as in `1 rule` and `2,000 rules`."""
+    return f"{number:,} {thing}{'s' * (number != 1)}"
+
+
 class Run:
     """The directory of one run, held by this process until `close`.
 

@@ -60,7 +60,10 @@ def train(
             delayed(watch)(*job, bar, trap) for job in jobs
         ):
             failed += code != 0
-            say(f"seed {number}: {'done' if code == 0 else message}, {path}")
+            if code == 0:
+                tqdm.write(f"{path}: done")
+            else:
+                say(f"seed {number}: {message}, {path}")
     if trap.number:
         raise Interrupted(trap.number)
     if failed:

@@ -50,13 +50,20 @@ class RunOptions:
             if getattr(self, name) < least:
                 flag = f"--{name}".replace("_", "-")
                 raise ValueError(f"{flag} must be at least {least}, got {getattr(self, name)}")
-        if self.name is not None and (
-            not self.name.strip(". ") or Path(self.name).name != self.name
-        ):
-            raise ValueError(f"--name must be a plain directory name, got {self.name!r}")
+        if self.threads > MOST_THREADS:
+            raise ValueError(f"--threads must be at most {MOST_THREADS}, got {self.threads}")
+        name = self.name
+        if name is None:
+            return
+        if not name.strip(". ") or Path(name).name != name or not name.isprintable():
+            raise ValueError(f"--name must be a plain directory name, got {name!r}")
+        if len(name.encode()) > LONGEST_NAME:
+            raise ValueError(f"--name must have at most {LONGEST_NAME} bytes, got {name[:40]}...")
 
 
 LEAST = {"checkpoint_every": 1, "keep": 1, "picture_every": 0, "video_every": 0, "threads": 1}
+MOST_THREADS = 256  # beyond some number a system starts no more, and the process dies of it
+LONGEST_NAME = 200  # bytes; file systems allow 255, and a name gets additions
 
 
 @dataclass
@@ -153,7 +160,7 @@ def reopen(path: Path, options: RunOptions, trials: int | None = None) -> Sessio
     """
     with contextlib.ExitStack() as undo:
         config, run, file = saved_config(path), None, path
-        if home := _home(path):
+        if home := home_of(path):
             run = Run.open(home, config, options.keep)
             undo.callback(run.close)
             file, state = _choose(home, path, config)
@@ -203,12 +210,12 @@ def saved_config(path: Path) -> Config:
     Raises:
         ValueError: there are none, or this version does not know them.
     """
-    if home := _home(path):
+    if home := home_of(path):
         return load_config(home)
     return from_dict(checkpoint.load(path)["config"])
 
 
-def _home(path: Path) -> Path | None:
+def home_of(path: Path) -> Path | None:
     """The run directory that a path is or lies in; None for a lone checkpoint file."""
     if not path.is_file():
         return path

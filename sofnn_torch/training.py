@@ -20,7 +20,7 @@ from sofnn_torch.factory import Agent
 from sofnn_torch.guard import Divergence, Interrupted, SignalTrap, diagnose, physics_warnings
 from sofnn_torch.monitoring import Monitor, Trajectory, TrialRecord
 from sofnn_torch.policy import FrozenPolicy
-from sofnn_torch.runs import say
+from sofnn_torch.runs import plural, say
 from sofnn_torch.session import RunOptions, Session, arithmetic, environment_seed
 
 __all__ = ["RunOptions", "environment_seed", "play", "replay", "resume", "train"]
@@ -147,7 +147,8 @@ def replay(path: Path) -> None:
     agent, env = session.build(from_dict(state["config"]))
     checkpoint.restore(path, state, agent, env)
     record, _ = play(env, agent)
-    say(f"trial {state['trial'] + 1}: {record.steps} steps, {record.rules} rules, no divergence")
+    learned = f"{record.steps} steps, {plural(record.rules, 'rule')}"
+    say(f"trial {state['trial'] + 1}: {learned}, no divergence")
 
 
 def _loop(session: Session, options: RunOptions, trap: SignalTrap) -> Path:
@@ -184,8 +185,8 @@ def _loop(session: Session, options: RunOptions, trap: SignalTrap) -> Path:
                 monitor.flush()  # the curves must not be behind the checkpoint
                 session.save()
             if agent.net.refused:
-                rules = agent.net.max_rules
-                run.warn("cap", f"{rules} rules reached (--net.max-rules): no more are added")
+                rules = plural(agent.net.max_rules, "rule")
+                run.warn("cap", f"{rules} reached (--net.max-rules): no more are added")
             progress.set_postfix_str(_summary(record, session.state, speed), refresh=False)
             progress.update()
     except Interrupted as stop:
@@ -218,4 +219,4 @@ def _summary(record: TrialRecord, state: dict[str, Any], speed: float) -> str:
     outcome = f"{record.steps} steps" if record.success else "no goal"
     recent = [success for success, _ in state["recent"]]
     share = f"goal in {sum(recent)} of {len(recent)}"
-    return f"{outcome}, {record.rules} rules, {share}, {speed:,.0f} steps/s"
+    return f"{outcome}, {plural(record.rules, 'rule')}, {share}, {speed:,.0f} steps/s"

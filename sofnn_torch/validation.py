@@ -11,6 +11,7 @@ POSITIVE |= {"grid", "grid_action", "segments", "temperature", "sigma_initial", 
 POSITIVE |= {"sigma_max", "mean_limit", "wheel_radius_scale", "wheel_base_scale", "trials"}
 POSITIVE |= {"trace_limit", "memory"}
 UNIT = {"gamma", "trace_decay"}  # in [0, 1]
+INTEGER = 2**63  # no whole number reaches it, so that every array and file can hold it
 NOT_NEGATIVE = {"seed", "replays"}
 MOST = {"hold": 10_000, "segments": 1_000, "max_rules": 10_000_000, "memory": 10_000_000}
 # Bounds of mu and sigma would hide a rate that makes a typical step longer than their range.
@@ -32,6 +33,8 @@ def check(config: Any, prefix: str = "") -> None:
         for number in value if isinstance(value, tuple) else (value,):
             if isinstance(number, bool) or not isinstance(number, int | float):
                 continue
+            if isinstance(number, int) and not abs(number) < INTEGER:
+                raise ValueError(f"{flag} must lie between -2**63 and 2**63, got {number}")
             if not abs(number) < 1e300:
                 raise ValueError(f"{flag} must be a finite number, got {number}")
             if number > MOST.get(name, math.inf):
@@ -75,7 +78,11 @@ def _typed(value: Any, hint: Any, name: str) -> Any:
         return None if value is None else _typed(value, choices[0], name)
     if hint is float and type(value) in (int, float) and abs(value) < 1e300:
         return float(value)
-    if hint in (int, bool, str) and type(value) is hint and (hint is not int or abs(value) < 2**63):
+    if (
+        hint in (int, bool, str)
+        and type(value) is hint
+        and (hint is not int or abs(value) < INTEGER)
+    ):
         return value
     wanted = " or ".join(map(str, choices)) if kind is Literal else getattr(hint, "__name__", hint)
     raise ValueError(f"{name} must be {wanted}, got {str(value)[:60]!r}")

@@ -1,5 +1,6 @@
 """The command line: what a newcomer sees, and one line for whatever is wrong."""
 
+import io
 import json
 import os
 import re
@@ -17,7 +18,7 @@ from conftest import settings as short
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
-from sofnn_torch import checkpoint, cli, seeds, training
+from sofnn_torch import checkpoint, cli, flags, seeds, training
 from sofnn_torch.cli import main, parse
 from sofnn_torch.config import Config, from_dict
 from sofnn_torch.factory import make_agent
@@ -87,10 +88,10 @@ def test_the_help_shows_the_values_of_the_chosen_preset(capsys):
 @pytest.mark.parametrize("network", ["sofnn", "fixed"])
 @pytest.mark.parametrize("name", ["default", "paper"])
 def test_flags_lie_on_top_of_the_preset(agent, network, name):
-    words = f"--preset {name} --network={network} --agent {agent} --net.theta 0.25".split()
-    config = parse(words).config
+    words = f"--preset {name} --network={network} --agent {agent} --net.width-position 0.05"
+    config = parse(words.split()).config
     expected = asdict(preset(agent, network, name))
-    expected["net"]["theta"] = 0.25
+    expected["net"]["width_position"] = 0.05
     assert asdict(config) == expected
 
 
@@ -115,6 +116,31 @@ def test_train_py_is_the_same_program(here):
     assert done.returncode == 2
     (line,) = done.stderr.splitlines()
     assert line.startswith("error: Unrecognized options: --tirals, 1; did you mean --trials?")
+
+
+def test_a_reader_that_leaves_early_is_no_error(here):
+    command = [sys.executable, str(ROOT / "train.py"), "--help"]
+    child = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    child.stdout.close()
+    assert child.stderr.read() == b""
+    assert child.wait(timeout=120) == 0
+
+
+def test_a_bad_mujoco_gl_is_one_line(here):
+    command = [sys.executable, str(ROOT / "train.py"), "--trials", "1"]
+    environment = os.environ | {"MUJOCO_GL": "nonsense"}
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=120)
+    assert done.returncode == 2 and not contents(here)
+    (line,) = done.stderr.splitlines()
+    assert "MUJOCO_GL=nonsense" in line and "egl, osmesa or glfw" in line
+
+
+def test_what_an_encoding_lacks_prints_as_question_marks(monkeypatch):
+    buffer = io.BytesIO()
+    monkeypatch.setattr("sys.stdout", io.TextIOWrapper(buffer, encoding="ascii"))
+    with flags.output():
+        print("150 ± 60 mm")
+    assert buffer.getvalue() == b"150 ? 60 mm\n"
 
 
 def test_interruption_says_how_to_go_on(here, monkeypatch, capsys):
@@ -188,15 +214,18 @@ def test_growth_without_end_stops_at_the_limit_and_says_so(agent, here, capsys):
         ("--reusme x", "did you mean --resume?"),
         ("--sga.rate-men 1", "did you mean --sga.rate-mean?"),
         ("extra", "extra"),
-        ("--agent dqn", "dqn"),
-        ("--network lstm", "--network must be sofnn or fixed"),
-        ("--preset best", "best"),
-        ("--pose gps", "gps"),
-        ("--trials", "--trials"),
-        ("--trials many", "--trials"),
+        ("--agent dqn", "--agent must be one of 'sga', 'q', got 'dqn'"),
+        ("--network lstm", "--network must be one of 'sofnn', 'fixed', got 'lstm'"),
+        ("--preset best", "--preset must be one of 'default', 'paper', got 'best'"),
+        ("--pose gps", "--pose must be one of 'estimated', 'true', 'odometry', got 'gps'"),
+        ("--trials", "--trials needs a value"),
+        ("--trials many", "--trials must be a whole number, got 'many'"),
         ("--trials -3", "--trials must be positive, got -3"),
         ("--trials 0", "--trials must be positive"),
         ("--seed -1", "--seed must not be negative"),
+        ("--seed 9223372036854775808", "--seed must lie between -2**63 and 2**63"),
+        ("--maze.max-steps 99999999999999999999", "--maze.max-steps must lie between -2**63"),
+        ("--seeds 0,9223372036854775808", "--seed must lie between -2**63 and 2**63"),
         ("--net.theta 0", "--net.theta must lie between 0 and 1"),
         ("--net.theta 1", "--net.theta must lie between 0 and 1"),
         ("--net.theta nan", "--net.theta must be a finite number"),
@@ -207,7 +236,10 @@ def test_growth_without_end_stops_at_the_limit_and_says_so(agent, here, capsys):
         ("--net.width-heading 1e-6", "every width must be at least 0.001"),
         ("--agent q --q.coding antecedent --net.width-action 1e-6", "every width must be at least"),
         ("--net.max-rules 0", "--net.max-rules must be positive"),
-        ("--net.grid 4 4", "--net.grid"),
+        ("--net.theta x", "--net.theta must be a number, got 'x'"),
+        ("--net.grid 4 4", "--net.grid needs 3 values"),
+        ("--net.grid 4 4 x", "--net.grid must be int, int, int, got '4', '4', 'x'"),
+        ("--agent q --q.trace-limit x", "--q.trace-limit must be FLOAT or None, got ['x']"),
         ("--network fixed --net.grid 999 999 999", "--net.max-rules"),
         ("--sga.gamma 1.5", "--sga.gamma must lie in"),
         ("--sga.rate-mean -1", "--sga.rate-mean must not be negative"),
@@ -216,13 +248,28 @@ def test_growth_without_end_stops_at_the_limit_and_says_so(agent, here, capsys):
         ("--agent q --q.segments 1000000000", "--q.segments must be at most"),
         ("--agent q --sga.gamma 0.5", "--sga.gamma has no effect with --agent q"),
         ("--q.gamma 0.5", "--q.gamma has no effect with --agent sga"),
+        ("--net.grid 3 3 3", "--net.grid has no effect without --network fixed"),
+        ("--network fixed --net.theta 0.9", "--net.theta has no effect with --network fixed"),
+        ("--network fixed --net.growth literal", "--net.growth has no effect with --network fixed"),
+        ("--network fixed --net.interpolate", "--net.interpolate has no effect with --network"),
+        ("--network fixed --net.grid-action 4", "no effect without --q.coding antecedent"),
+        ("--agent q --net.width-action 1", "no effect without --q.coding antecedent"),
+        ("--sga.constant 1", "--sga.constant has no effect with --sga.baseline value"),
+        ("--preset paper --sga.rate-value 2", "has no effect without a learned baseline"),
+        ("--sga.replays 0 --sga.memory 9", "--sga.memory has no effect with --sga.replays 0"),
+        ("--workers 2", "--workers has no effect without --seeds"),
+        ("--replay x --agent q --trials 5", "--agent has no effect with --replay"),
+        ("--replay x --trials 5", "--trials has no effect with --replay"),
+        ("--replay x --seeds 0-3", "--seeds has no effect with --replay"),
         ("--maze.hold 0", "--maze.hold must be positive"),
         ("--maze.hold 10000000000", "--maze.hold must be at most"),
         ("--maze.motor-noise 1", "--maze.motor-noise must lie in"),
         ("--keep 0", "--keep must be at least 1"),
         ("--checkpoint-every 0", "--checkpoint-every must be at least 1"),
         ("--threads 0", "--threads must be at least 1"),
+        ("--threads 1000000", "--threads must be at most 256"),
         ("--name a/b", "--name must be a plain directory name"),
+        ("--name=" + "x" * 300, "--name must have at most 200 bytes"),
         ("--seeds 3-1", "--seeds must be a list"),
         ("--seeds 1,x", "--seeds must be a list"),
         ("--seeds 1,1", "--seeds must be a list"),
@@ -232,7 +279,7 @@ def test_growth_without_end_stops_at_the_limit_and_says_so(agent, here, capsys):
         ("--resume nowhere", "not a run directory"),
         ("--replay nowhere", "cannot be read"),
         ("--runs /dev/null", "cannot be used"),
-        ("--trials " + "9" * 400, "--trials must be a finite number"),
+        ("--trials " + "9" * 400, "--trials must lie between -2**63 and 2**63"),
     ],
 )
 def test_bad_flags_get_one_clear_line_and_leave_nothing(words, message, here, capsys):
@@ -249,6 +296,8 @@ def test_bad_flags_get_one_clear_line_and_leave_nothing(words, message, here, ca
         ("--pose true", "--pose true contradicts"),
         ("--trials 1", "has 2 trials already"),
         ("--name other", "--name is for new runs"),
+        ("--runs other", "--runs is for new runs"),
+        ("--workers 2", "--workers has no effect without --seeds"),
         ("--seeds 0-3", "--resume goes with neither"),
         ("--replay x", "--resume goes with neither"),
     ],
@@ -257,6 +306,10 @@ def test_a_resumed_run_keeps_its_settings(words, message, run, capsys):
     before = contents(run)
     assert message in bad(["--resume", str(run), *words.split()], capsys)
     assert contents(run) == before
+
+
+def test_a_name_of_two_lines_is_refused(here, capsys):
+    assert "--name must be a plain directory name" in bad(["--name", "a\nb"], capsys)
 
 
 @pytest.mark.parametrize("data", [b"", b"{", b"[]", b'{"config": 3}', b"\xff\xfe", b"[" * 100_000])
@@ -309,8 +362,9 @@ def test_a_crash_of_one_seed_leaves_the_others(here, capsys, monkeypatch):
 
     monkeypatch.setattr(seeds.subprocess, "Popen", popen)
     assert main(["--seeds", "0-1", "--workers", "2", "--trials", "1", *QUICK]) == 1
-    err = capsys.readouterr().err
-    assert "seed 0: done" in err and "seed 1: exit code -9" in err and "1 of 2" in err
+    out, err = capsys.readouterr()
+    assert out == "runs/sga-sofnn-estimated-s0: done\n"
+    assert "seed 1: exit code -9" in err and "1 of 2" in err
     assert checkpoint.find_latest(Path("runs/sga-sofnn-estimated-s0"))[1]["trial"] == 1
 
 
@@ -421,3 +475,8 @@ def test_any_arguments_are_parsed_or_refused_in_one_line(arguments):
 def test_a_config_survives_its_file(tmp_path):
     config = short("q", "fixed", q={"trace_limit": None}, net={"grid": (3, 5, 7)}, trials=1)
     assert load_config(training.train(config, quick_options(tmp_path))) == config
+
+
+def test_the_largest_seed_can_be_read_again():
+    config = Config(seed=2**63 - 1)
+    assert from_dict(json.loads(config.to_json())) == config

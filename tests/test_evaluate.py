@@ -3,7 +3,9 @@
 import dataclasses
 import json
 import math
+import runpy
 from dataclasses import replace
+from pathlib import Path
 
 import imageio.v3 as imageio
 import numpy as np
@@ -99,7 +101,7 @@ def test_the_command_prints_a_table_and_leaves_the_run_alone(
         results.append(file.read_text())
     assert results[0] == results[1]  # the same seed, the same trials
     table = capsys.readouterr().out
-    assert "2 trials learned" in table
+    assert "2 trials learned" in table and f"written: {file}" in table
     assert "over the kinematic optimum" in table
     data = json.loads(results[0])
     assert [trial["trial"] for trial in data["trials"]] == [1, 2, 3]
@@ -142,7 +144,23 @@ def test_a_damaged_checkpoint_is_named_and_the_one_before_is_taken(trained, tmp_
     newest.write_bytes(newest.read_bytes()[:-10])
     with pytest.raises(ValueError, match="no rule"):
         evaluate.load(copy)  # what is left has learned nothing
-    assert "checkpoint-2.pt: damaged" in capsys.readouterr().err
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "checkpoint-2.pt: damaged" in line and "use an earlier" not in line
+    assert line.endswith("; checkpoint-0.pt is used instead")
+
+
+def test_a_checkpoint_file_stands_for_its_run(trained, tmp_path, monkeypatch, capsys):
+    file = trained / "checkpoint-2.pt"
+    lone = tmp_path / "lone.pt"
+    lone.write_bytes(file.read_bytes())
+    for path in (trained, file, lone):
+        config, agent, used, state = evaluate.load(path)
+        assert config.maze.max_steps == 120 and state["trial"] == 2 and agent.net.n_rules
+        assert used == (file if path == trained else path)
+    assert call(monkeypatch, lone, "--episodes", "1") == 0
+    assert f"{lone}: 2 trials learned" in capsys.readouterr().out
+    assert call(monkeypatch, lone, "--best") == 2
+    assert "--best chooses a checkpoint of a run directory" in capsys.readouterr().err
 
 
 def test_video_shows_the_maze(trained, tmp_path):
@@ -161,7 +179,7 @@ def test_video_shows_the_maze(trained, tmp_path):
     ("arguments", "message"),
     [
         (["nowhere"], "not a run directory"),
-        ([], "RUN"),
+        ([], "RUN is missing: Directory of the run, "),
         (["RUN", "--epsodes", "3"], "did you mean --episodes?"),
         (["RUN", "--episodes", "many"], "--episodes"),
         (["RUN", "--episodes", "0"], "--episodes must be at least 1"),
@@ -182,6 +200,19 @@ def test_bad_input_gives_one_line_and_exit_code_2(
     assert message in line
 
 
+@pytest.mark.parametrize(
+    ("arguments", "message"), [([], "RUN is missing"), (["nowhere"], "not a run directory")]
+)
+def test_the_pictures_of_the_readme_need_a_run(monkeypatch, capsys, arguments, message):
+    file = Path(__file__).parents[1] / "docs" / "make_images.py"
+    monkeypatch.setattr("sys.argv", [file.name, *arguments])
+    with pytest.raises(SystemExit) as stop:
+        runpy.run_path(str(file), run_name="__main__")
+    assert stop.value.code == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("error: ") and message in line
+
+
 def test_a_checkpoint_of_other_settings_is_refused(trained, tmp_path, monkeypatch, capsys):
     copy = tmp_path / "run"
     copy.mkdir()
@@ -190,7 +221,8 @@ def test_a_checkpoint_of_other_settings_is_refused(trained, tmp_path, monkeypatc
     settings["config"]["net"]["theta"] = 0.7
     (copy / "config.json").write_text(json.dumps(settings))
     assert call(monkeypatch, copy) == 2
-    assert "net.theta" in capsys.readouterr().err
+    line = capsys.readouterr().err
+    assert "net.theta" in line and "train anew" not in line
 
 
 @pytest.mark.parametrize(

@@ -363,7 +363,7 @@ def poisoned(env, decision, change):
 def test_parameters_that_are_not_finite_are_named(agent, part, value):
     learner, env = parts(settings(agent))
     getattr(learner.net, part)[0, 0] = value
-    with pytest.raises(Divergence, match=f"{part} of .* rules"):
+    with pytest.raises(Divergence, match=f"{part} of .* rules, as in rule 1: "):
         play(env, learner)
 
 

@@ -2,10 +2,13 @@
 
 import dataclasses
 import math
+import subprocess
+import sys
 
 import numpy as np
 import pytest
 
+from sofnn_torch import optimum
 from sofnn_torch.maze import KheperaMazeEnv
 from sofnn_torch.optimum import STEP_LENGTH, STEP_TURN, optimal_steps
 from sofnn_torch.physics import MazePlan, Physics
@@ -57,6 +60,20 @@ def test_an_unreachable_goal_is_an_error():
     wall = (0.5, 0.0, 0.52, 1.0)
     with pytest.raises(ValueError, match="cannot be reached"):
         optimal_steps(room((0.2, 0.5, 0.0), (0.8, 0.5), [wall]), 10, 0.01)
+
+
+def test_the_help_is_that_of_the_command():
+    command = [sys.executable, "-m", "sofnn_torch.optimum", "--help"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0 and "usage: python -m sofnn_torch.optimum" in done.stdout
+
+
+def test_unknown_flags_are_refused(monkeypatch, capsys):
+    monkeypatch.setattr("sys.argv", ["optimum", "--foo"])
+    with pytest.raises(SystemExit) as stop:
+        optimum.main()
+    assert stop.value.code == 2
+    assert capsys.readouterr().err.startswith("error: Unrecognized options: --foo")
 
 
 def test_the_papers_516_steps_are_110_percent_of_the_optimum(held):

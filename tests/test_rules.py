@@ -7,6 +7,7 @@ import json
 import math
 import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -123,6 +124,34 @@ def test_every_float_survives():
     texts = list(map(repr, rulefiles.shortest(numbers).tolist()))
     assert np.float32(list(map(float, texts))).tobytes() == numbers.tobytes()
     assert rulefiles.shortest(np.float32([0.06, -0.45])).tolist() == [0.06, -0.45]
+
+
+def test_a_checkpoint_file_stands_for_its_run(run, tmp_path, call):
+    file = run / "checkpoint-2.pt"
+    lone = Path(shutil.copy(file, tmp_path / "lone.pt"))
+    texts = [call(path, "--top", 3)[1].split(": ", 1) for path in (run, file, lone)]
+    assert [text[0] for text in texts] == [str(path) for path in (file, file, lone)]
+    assert len({text[1] for text in texts}) == 1
+    edited = written(evaluate.load(file)[1], tmp_path / "rules.json")
+    assert call(file, "--load", edited)[0] == 0
+    assert checkpoint.find_latest(run.with_name("run-edited"))[1]["trial"] == 2
+    code, _, error = call(lone, "--load", edited)
+    assert code == 2 and "--load needs a run directory or a checkpoint in one" in error
+
+
+def test_files_that_were_written_are_named(run, tmp_path, call):
+    files = [tmp_path / "rules.json", tmp_path / "rules.csv"]
+    code, text, _ = call(run, "--json", files[0], "--csv", files[1])
+    assert code == 0 and text.splitlines()[-2:] == [f"written: {file}" for file in files]
+    assert "took no part" in text and "THEN" not in text
+
+
+def test_a_pose_outside_the_maze_is_answered_with_a_warning(run, call):
+    code, text, error = call(run, "--at", 5, 0.5, 0)
+    (line,) = error.splitlines()
+    assert code == 0 and "action: " in text
+    assert line == "warning: --at 5 0.5 is outside the maze of 1 x 1 m"
+    assert not call(run, "--at", 0.5, 0.5, 0)[2]
 
 
 @pytest.mark.parametrize("variant", ["three", "shared", "grid", "q-onehot", "q-antecedent"])
@@ -301,6 +330,8 @@ def test_a_rule_that_all_rules_together_overrule_is_marked():
     text = rules.summary(np.array([0.5, 0.45, 0.05]), 10, said)
     assert "3 rules: 1 make up 50 % of the firing along the trial, 2 make up 90 %, 0 took" in text
     assert "2 rules (*) are outvoted" in text
+    one = replace(said, outvoted=np.array([True, False, False]))
+    assert "1 rule (*) is outvoted" in rules.summary(np.ones(3) / 3, 10, one)
     assert "2 took no part" in rules.summary(np.array([0.9991, 0.0009, 0.0]), 10, said)
 
 
@@ -443,7 +474,7 @@ def test_files_are_the_same_every_time(run, tmp_path, call):
         (["RUN", "--tpo", "3"], "did you mean --top?"),
         (["RUN", "--top", "-1"], "--top must not be negative"),
         (["RUN", "--seed", "-1"], "--seed must not be negative"),
-        (["RUN", "--at", "0.1", "0.1"], "--at"),
+        (["RUN", "--at", "0.1", "0.1"], "--at must be FLOAT FLOAT FLOAT or None, got ['0.1', '"),
         (["RUN", "--at", "0.1", "nan", "0"], "--at needs three finite numbers"),
         (["RUN", "--at", "inf", "0.1", "0"], "--at needs three finite numbers"),
         (["RUN", "--json", "rules.csv"], "--json must end in .json"),

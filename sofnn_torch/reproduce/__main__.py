@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Literal
 
 from sofnn_torch import seeds
-from sofnn_torch.flags import parse
+from sofnn_torch.flags import output, parse
 from sofnn_torch.guard import Interrupted
 from sofnn_torch.optimum import optimal_steps
 from sofnn_torch.physics import Physics
@@ -115,7 +115,8 @@ def run(options: Options) -> int:
 def main() -> None:
     """Entry point of ``python -m sofnn_torch.reproduce``."""
     try:
-        sys.exit(run(parse(Options, sys.argv[1:], __doc__)))
+        with output():
+            sys.exit(run(parse(Options, sys.argv[1:], __doc__)))
     except (ValueError, OSError) as error:
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
         sys.exit(2)
