@@ -151,7 +151,11 @@ def _refuse_idle(flags: Flags, base: Flags) -> None:
         (config.network != "fixed", "net.grid net.grid_action", "without --network fixed"),
         (not action, "net.grid_action net.width_action", "without --q.coding antecedent"),
         (sga.baseline == "value", "sga.constant", "with --sga.baseline value"),
-        (sga.baseline != "value", "sga.rate_value sga.initial_value", "without a learned baseline"),
+        (
+            sga.baseline != "value",
+            "sga.rate_value sga.value_limit sga.initial_value",
+            "without a learned baseline",
+        ),
         (not sga.replays, "sga.memory", "with --sga.replays 0"),
         (not q.replays, "q.memory", "with --q.replays 0"),
         (flags.seeds is None, "workers", "without --seeds"),

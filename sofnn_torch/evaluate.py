@@ -128,10 +128,10 @@ def evaluate(
 
     Args:
         config: settings of the run.
-        agent: the learner; only its random generator moves, and only if explore.
+        agent: the learner; only its random generator changes, which begins anew from the seed.
         episodes: number of trials.
         explore: sample the stochastic policy.
-        seed: seed of the motor noise and of the sampled actions.
+        seed: seed of the motor noise and of the policy's chance.
         render_mode: ``human`` shows the trials in a window.
     """
     env = make_env(config, render_mode=render_mode)
@@ -228,7 +228,6 @@ def plain(row: Estimate) -> dict[str, float | None]:
 
 def write_video(path: Path, config: Config, agent: Agent, seed: int, explore: bool) -> None:
     """Film the first trial that `evaluate` plays with the same seed, 30 times as fast as it is."""
-    agent.rng = np.random.default_rng(seed)
     if path.suffix == ".gif":
         path.write_bytes(gif(film(config, agent, seed, explore, steps_per_frame=5, size=360)))
         return
