@@ -165,7 +165,7 @@ class QLearning:
             return None
         if self.antecedents:  # they have moved
             with torch.no_grad():
-                firing = self.net.normalised_firing(self._inputs(x))
+                firing = self.net.normalised_firing(self.inputs(x))
         return self._choose(x, firing)
 
     def act(self, observation: np.ndarray, explore: float = 0) -> int | np.ndarray:
@@ -178,7 +178,7 @@ class QLearning:
         """
         x = self._tensor(observation)
         with torch.no_grad():
-            values = self.action_values(x, self.net.normalised_firing(self._inputs(x)))
+            values = self.action_values(x, self.net.normalised_firing(self.inputs(x)))
         if explore:
             return self._command(*self._draw(values.tolist(), explore))
         segment = int(values.argmax())
@@ -187,7 +187,7 @@ class QLearning:
     def strongest_rule(self, observation: np.ndarray) -> int:
         """The rule that fires most at the state (n,)."""
         with torch.no_grad():
-            firing = self.net.normalised_firing(self._inputs(self._tensor(observation)))
+            firing = self.net.normalised_firing(self.inputs(self._tensor(observation)))
         return int(firing.argmax()) % self.net.n_rules
 
     def statistics(self) -> dict[str, float]:
@@ -222,7 +222,7 @@ class QLearning:
 
         Args:
             x: state, or many. Shape: (n,) or (B, n).
-            firing: normalised firing at ``_inputs(x)``.
+            firing: normalised firing at ``inputs(x)``.
 
         Returns:
             Shape: (J,) or (B, J).
@@ -233,11 +233,17 @@ class QLearning:
         features = torch.cat(self._beside(x, self.tails), -1)
         return (features * conclusions).sum(-1)
 
+    def inputs(self, x: Tensor) -> Tensor:
+        """Network inputs at states (.., n): the same, or with every action (.., J, n + 1)."""
+        if self.coding != "antecedent":
+            return x
+        return torch.cat(self._beside(x, self.codes), -1)
+
     def _firing(self, x: Tensor) -> Tensor:
         """Normalised firing at x: (K,), or (J, K) if the action is an antecedent."""
         if self.coding != "antecedent":
             return self.net.observe(x)
-        inputs = self._inputs(x)
+        inputs = self.inputs(x)
         if self.net.n_rules == 0:
             self.net.grow(inputs[self.segments // 2])
         with torch.no_grad():
@@ -281,7 +287,7 @@ class QLearning:
         net, (features_of, firing_at) = self.net, self.net.firing_functions()
         seen = self.memory.sample(self.config.replays, self.rng, self.rates)
         here = features_of(seen["features"][..., : net.n_inputs])
-        there = features_of(self._inputs(seen["following"]))
+        there = features_of(self.inputs(seen["following"]))
         for x, ahead, *row in zip(here, there, *seen.values(), strict=True):
             features, reward, goes_on, following = row
             best = self.action_values(following, firing_at(ahead)).amax(-1)
@@ -312,12 +318,6 @@ class QLearning:
             forward, turn = 1 - abs(scalar), TURN * scalar
             return [forward - turn, forward + turn]
         return [scalar]
-
-    def _inputs(self, x: Tensor) -> Tensor:
-        """Network inputs at states (.., n): the same, or with every action (.., J, n + 1)."""
-        if self.coding != "antecedent":
-            return x
-        return torch.cat(self._beside(x, self.codes), -1)
 
     def _beside(self, x: Tensor, codes: Tensor) -> tuple[Tensor, Tensor]:
         """States (.., n) and codes (J, c), repeated so that each stands beside each."""

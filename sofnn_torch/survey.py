@@ -11,6 +11,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from sofnn_torch.qlearning import QLearning
+
 if TYPE_CHECKING:
     from sofnn_torch.factory import Agent
 
@@ -45,9 +47,11 @@ def survey(agent: "Agent", states: NDArray[Any]) -> Survey:
 
 def _ask(agent: "Agent", states: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     x = states.to(agent.net.default_width)
-    if hasattr(agent, "codes"):  # Q-learning: the best of the values of all actions, eq. 10
-        columns = [_action_value(agent, x, code) for code in agent.codes]
-        value, best = torch.stack(columns, 1).max(1)
+    if isinstance(agent, QLearning):
+        inputs = agent.inputs(x)
+        firing = agent.net.normalised_firing(inputs.reshape(-1, inputs.shape[-1]))
+        values = agent.action_values(x, firing.reshape(*inputs.shape[:-1], -1))
+        value, best = values.max(1)
         action = x.new_tensor(agent.representatives)[best]
     else:
         outputs = agent.net(x)
@@ -60,14 +64,6 @@ def _ask(agent: "Agent", states: torch.Tensor) -> tuple[torch.Tensor, torch.Tens
         if agent.config.actions == "three":
             action = (action > 1 / 3).to(action) - (action < -1 / 3).to(action)
     return 1 - action.abs(), action, value
-
-
-def _action_value(agent: Any, x: torch.Tensor, code: torch.Tensor) -> torch.Tensor:
-    """Q(x, a) of equation 10 for one action at states x (B, n). Shape: (B,)."""
-    inputs = torch.cat([x, code.expand(len(x), -1)], 1) if agent.coding == "antecedent" else x
-    conclusions = agent.net(inputs)  # (B, n + length + 1)
-    n = x.shape[1]
-    return (conclusions[:, :n] * x).sum(1) + conclusions[:, n:-1] @ code + conclusions[:, -1]
 
 
 def usage(agent: "Agent", states: NDArray[Any]) -> NDArray[np.float64]:

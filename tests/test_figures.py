@@ -58,7 +58,7 @@ def test_survey_of_q_agrees_with_the_greedy_action(coding):
     assert answer.turn.tolist() == turns
     assert answer.forward.tolist() == [1 - abs(turn) for turn in turns]
     state = torch.tensor(STATES[0]).float()
-    firing = agent.net.normalised_firing(agent._inputs(state))
+    firing = agent.net.normalised_firing(agent.inputs(state))
     assert answer.value[0] == pytest.approx(agent.action_values(state, firing).max().item(), 1e-4)
 
 

@@ -373,7 +373,7 @@ def test_the_rules_at_a_state_add_up_to_what_the_learner_says(trained, variant):
             if config.agent == "sga":
                 expected, chosen = agent.net(x[None])[0], None
             else:
-                expected = agent.action_values(x, agent.net.normalised_firing(agent._inputs(x)))
+                expected = agent.action_values(x, agent.net.normalised_firing(agent.inputs(x)))
                 chosen = agent.representatives[int(expected.argmax())]
         assert decision.outputs == pytest.approx(expected.numpy(), rel=1e-4, abs=1e-5)
         assert decision.shares.sum(0) == pytest.approx(1.0, abs=1e-5)
