@@ -142,28 +142,11 @@ def _refuse_idle(flags: Flags, base: Flags) -> None:
     alone = Flags(Config(), RunOptions(), replay=flags.replay)
     if flags.replay and (others := _changes(flags, alone)):
         raise ValueError(f"{_flag(others[0])} has no effect with --replay")
-    config, sga, q = flags.config, flags.config.sga, flags.config.q
-    action = config.agent == "q" and q.coding == "antecedent"
-    rules = (  # when, which settings or tables of settings, why
-        (config.agent != "sga", "sga", "with --agent q"),
-        (config.agent != "q", "q", "with --agent sga"),
-        (config.network == "fixed", "net.theta net.growth net.interpolate", "with --network fixed"),
-        (config.network != "fixed", "net.grid net.grid_action", "without --network fixed"),
-        (not action, "net.grid_action net.width_action", "without --q.coding antecedent"),
-        (sga.baseline == "value", "sga.constant", "with --sga.baseline value"),
-        (
-            sga.baseline != "value",
-            "sga.rate_value sga.value_limit sga.initial_value",
-            "without a learned baseline",
-        ),
-        (not sga.replays, "sga.memory", "with --sga.replays 0"),
-        (not q.replays, "q.memory", "with --q.replays 0"),
-        (flags.seeds is None, "workers", "without --seeds"),
-    )
+    idle = flags.config.idle() | ({} if flags.seeds is not None else {"workers": "without --seeds"})
     for name in _changes(flags, base):
-        for idle, names, why in rules:
-            if idle and {name, name.partition(".")[0]} & set(names.split()):
-                raise ValueError(f"{_flag(name)} has no effect {why}")
+        why = idle.get(name) or idle.get(name.partition(".")[0])
+        if why:
+            raise ValueError(f"{_flag(name)} has no effect {why}")
 
 
 def _changes(ours: Any, theirs: Any) -> list[str]:

@@ -108,6 +108,24 @@ class Config:
         """The settings as readable JSON."""
         return json.dumps(dataclasses.asdict(self), indent=2)
 
+    def idle(self) -> dict[str, str]:
+        """Settings, or whole tables of them, that change nothing beside the others, and why."""
+        sga, q, fixed = self.sga, self.q, self.network == "fixed"
+        valued, acting = sga.baseline == "value", self.agent == "q" and q.coding == "antecedent"
+        reasons = (
+            (self.agent != "sga", "sga", "with --agent q"),
+            (self.agent != "q", "q", "with --agent sga"),
+            (not acting, "net.grid_action net.width_action", "without --q.coding antecedent"),
+            (fixed, "net.theta net.growth net.interpolate", "with --network fixed"),
+            (not fixed, "net.grid net.grid_action", "without --network fixed"),
+            (valued, "sga.constant", "with --sga.baseline value"),
+            (not valued, "sga.rate_value sga.initial_value", "without a learned baseline"),
+            (not valued, "sga.value_limit", "without a learned baseline"),
+            (not sga.replays, "sga.memory", "with --sga.replays 0"),
+            (not q.replays, "q.memory", "with --q.replays 0"),
+        )
+        return {name: why for idle, names, why in reasons if idle for name in names.split()}
+
     def _check_together(self) -> None:
         """Raise ValueError on settings that exclude each other."""
         net, sga, q = self.net, self.sga, self.q
@@ -116,9 +134,10 @@ class Config:
         if sga.replays and sga.baseline == "constant":
             raise ValueError("--sga.replays needs --sga.baseline value: set --sga.replays 0")
         learner, reward = (q if self.agent == "q" else sga), self.maze.goal_reward
-        if learner.value_limit is not None and learner.value_limit < reward:
+        limit = None if f"{self.agent}.value_limit" in self.idle() else learner.value_limit
+        if limit is not None and limit < reward:
             raise ValueError(
-                f"--{self.agent}.value-limit {learner.value_limit:g} must be at least "
+                f"--{self.agent}.value-limit {limit:g} must be at least "
                 f"--maze.goal-reward {reward:g}, or None"
             )
         if q.actions == "three" and q.segments != 3:

@@ -8,7 +8,7 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from sofnn_torch.config import Config, NetworkConfig, QConfig, SGAConfig
+from sofnn_torch.config import Config, from_dict
 from sofnn_torch.presets import preset
 from sofnn_torch.runs import flatten
 
@@ -247,15 +247,12 @@ def changed(arm: Arm) -> str:
 
 def essence(config: Config) -> Config:
     """The settings without those that have no effect in this run, to find runs that are equal."""
-    idle = NetworkConfig()
-    net = config.net
-    if config.network == "fixed":
-        net = dataclasses.replace(
-            net, theta=idle.theta, growth=idle.growth, interpolate=idle.interpolate
-        )
-    else:
-        net = dataclasses.replace(net, grid=idle.grid, grid_action=idle.grid_action)
-    if config.agent == "sga" or config.q.coding != "antecedent":
-        net = dataclasses.replace(net, width_action=idle.width_action, grid_action=idle.grid_action)
-    other = {"q": QConfig()} if config.agent == "sga" else {"sga": SGAConfig()}
-    return dataclasses.replace(config, preset="default", net=net, **other)
+    data, defaults = (dataclasses.asdict(c) for c in (config, Config()))
+    data["preset"] = defaults["preset"]
+    for name in config.idle():
+        table, _, entry = name.partition(".")
+        if entry:
+            data[table][entry] = defaults[table][entry]
+        else:
+            data[table] = defaults[table]
+    return from_dict(data)
