@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from learning import SIZES, decide, fill, learner, states
+from learning import SIZES, both_passes, decide, fill, learner, states
 from timing import arguments, interleaved, median, ratio, report
 from torch import Tensor
 
@@ -122,30 +122,19 @@ def conclude(table: Tensor, x: Tensor) -> Tensor:
     return (-0.5 * squares.sum(1)).softmax(-1) @ consequents.T
 
 
-def batches(repeats: int) -> list[dict[str, Any]]:
+def batch(rules: int, repeats: int) -> dict[str, Any]:
     """Forward and backward pass for 64 states, by the network and compiled."""
-    rows, x = [], torch.from_numpy(states(64, seed=1))
-    for rules in SIZES:
-        net = SOFNN(3, 4, width=(0.06, 0.06, 0.45), interpolate=False)
-        fill(net, rules)
-        together = torch.compile(conclude)
-
-        def run(forward: Callable[[], Tensor], net: SOFNN = net) -> Callable[[], None]:
-            def passes() -> None:
-                net.zero_grad()
-                forward().sum().backward()
-
-            return passes
-
-        functions = {
-            "eager": run(lambda net=net: net(x)),
-            "compiled": run(lambda net=net, together=together: together(net.table(), x)),
-        }
-        times = interleaved(functions, repeats, seconds=0.2)
-        row: dict[str, Any] = {"rules": f"{rules:,}"}
-        row |= {f"{name} us": median(values) for name, values in times.items()}
-        rows.append(row | {"compiled over eager": ratio(times["compiled"], times["eager"])})
-    return rows
+    net = SOFNN(3, 4, width=(0.06, 0.06, 0.45), interpolate=False)
+    fill(net, rules)
+    together = torch.compile(conclude)
+    functions = {
+        "eager": both_passes(net, 64),
+        "compiled": both_passes(net, 64, lambda x: together(net.table(), x)),
+    }
+    times = interleaved(functions, repeats, seconds=0.2)
+    row: dict[str, Any] = {"rules": f"{rules:,}"}
+    row |= {f"{name} us": median(values) for name, values in times.items()}
+    return row | {"compiled over eager": ratio(times["compiled"], times["eager"])}
 
 
 @arithmetic()
@@ -165,7 +154,8 @@ def main() -> None:
         row: dict[str, Any] = {"rules": f"{rules:,}", "compiling s": seconds}
         row |= {f"{name} us": median(values) for name, values in times.items()}
         rows.append(row | {"compiled over eager": ratio(times["compiled"], times["eager"])})
-    report(options, a_decision=rows, a_batch_of_64=batches(options.repeats))
+    batches = [batch(rules, options.repeats) for rules in SIZES]
+    report(options, a_decision=rows, a_batch_of_64=batches)
 
 
 if __name__ == "__main__":

@@ -20,6 +20,7 @@ from timing import arguments, report
 
 HERE = Path(__file__).parents[1]
 FRAME = re.compile(r"([^;]+) \(([^;:]+)[^;]*\)")
+RECORD = ("record", "--rate", "500", "--format", "raw", "--output")
 QUIET = ("--quiet", "--picture-every", "0", "--video-every", "0")
 TOP = 14
 
@@ -28,16 +29,7 @@ def profile(checkout: Path, flags: list[str]) -> tuple[Counter[str], float]:
     """Samples by function, and the seconds of the run."""
     with tempfile.TemporaryDirectory() as place:
         stacks = Path(place, "stacks.txt")
-        command = [
-            Path(sys.executable).with_name("py-spy"),
-            "record",
-            "--rate",
-            "500",
-            "--format",
-            "raw",
-            "--output",
-            stacks,
-        ]
+        command = [Path(sys.executable).with_name("py-spy"), *RECORD, stacks]
         command += ["--", sys.executable, checkout / "train.py", *flags, *QUIET]
         command += ["--runs", Path(place, "runs")]
         subprocess.run(command, check=True, cwd=checkout, capture_output=True)

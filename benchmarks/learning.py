@@ -20,6 +20,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import torch
 from timing import arguments, interleaved, median, ratio, report
+from torch import Tensor
 
 from sofnn_torch.factory import Agent, make_agent
 from sofnn_torch.presets import preset
@@ -75,6 +76,19 @@ def minimal(rules: int, outputs: int) -> Callable[[], Any]:
         firing = torch.exp(-0.5 * (z * z).sum(1))
         y = (firing / firing.sum()) @ c
         return torch.autograd.grad(y.sum(), (u, v, c))
+
+    return run
+
+
+def both_passes(
+    net: torch.nn.Module, batch: int, forward: Callable[[Tensor], Tensor] | None = None
+) -> Callable[[], Any]:
+    """Return a function that runs a forward pass, by default the network's, and the backward."""
+    x, forward = torch.from_numpy(states(batch, seed=1)), forward or net
+
+    def run() -> None:
+        net.zero_grad()
+        forward(x).sum().backward()
 
     return run
 

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from learning import SIZES, fill, states
+from learning import SIZES, both_passes, fill, states
 from neuro_fuzzy_toolbox.func import Gaussian_MF
 from neuro_fuzzy_toolbox.models.anfis import rule_reduced_ANFIS
 from timing import arguments, interleaved, median, ratio, report
@@ -30,17 +30,6 @@ def ours(rules: int, period: float = 0.0) -> SOFNN:
     net = SOFNN(3, 4, width=widths, periods=(0, 0, period), interpolate=False)
     fill(net, rules)
     return net
-
-
-def both_passes(net: torch.nn.Module, batch: int) -> Callable[[], Any]:
-    """Return a function that runs the forward and the backward pass."""
-    x = torch.from_numpy(states(batch, seed=1))
-
-    def run() -> None:
-        net.zero_grad()
-        net(x).sum().backward()
-
-    return run
 
 
 def adding(net: SOFNN) -> Callable[[], Any]:

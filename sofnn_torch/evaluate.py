@@ -116,6 +116,12 @@ def load(run: Path, best: bool = False) -> tuple[Config, Agent, Path, dict[str, 
     return config, agent, path, state
 
 
+def learned(agent: Agent, path: Path, state: dict[str, Any]) -> str:
+    """For the terminal: what was loaded, in numbers."""
+    trials, rules = plural(state["trial"], "trial"), plural(agent.net.n_rules, "rule")
+    return f"{path}: {trials} learned, {rules}"
+
+
 def evaluate(
     config: Config,
     agent: Agent,
@@ -257,8 +263,7 @@ def run(options: Options) -> dict[str, Estimate]:
     env = make_env(config)
     rows = summarise(records, optimal_steps(env.unwrapped.plan, config.maze.hold).steps)
     env.close()
-    learned = f"{plural(state['trial'], 'trial')} learned, {plural(agent.net.n_rules, 'rule')}"
-    print(f"{path}: {learned}")
+    print(learned(agent, path, state))
     print(f"{plural(options.episodes, 'trial')} with {policy} actions:")
     Console().print(table(rows))
     if options.json:

@@ -26,7 +26,7 @@ from rich.table import Table
 
 from sofnn_torch import checkpoint, explain, figures, rulefiles
 from sofnn_torch.config import Config
-from sofnn_torch.evaluate import load
+from sofnn_torch.evaluate import learned, load
 from sofnn_torch.explain import Decision, Reading, number
 from sofnn_torch.factory import Agent, make_env
 from sofnn_torch.flags import command
@@ -111,12 +111,13 @@ def summary(shares: NDArray[Any], decisions: int, reading: Reading) -> str:
     idle = int((shares * decisions < FIRED).sum())
     text = f"{plural(len(shares), 'rule')}: {half:,} make up 50 % of the firing along the trial, "
     text += f"{most:,} make up 90 %, {idle:,} took no part"
-    outvoted = int(reading.outvoted.sum())
-    if outvoted == 1:
-        text += "\n1 rule (*) is outvoted: where it is centred, all rules "
-    elif outvoted:
-        text += f"\n{outvoted:,} rules (*) are outvoted: where they are centred, all rules "
-    return text + "together choose another action" * bool(outvoted)
+    if outvoted := int(reading.outvoted.sum()):
+        verb, where = ("is", "it is") if outvoted == 1 else ("are", "they are")
+        text += (
+            f"\n{plural(outvoted, 'rule')} (*) {verb} outvoted: where {where} centred, all rules "
+        )
+        text += "together choose another action"
+    return text
 
 
 def table(reading: Reading, shares: NDArray[Any], top: int) -> Table:
@@ -257,8 +258,7 @@ def run(options: Options) -> None:
         new, rules = edit(options, config, agent, path, state), agent.net.n_rules
         print(f"{new}: {plural(rules, 'rule')} from {options.load}, the rest from {path}")
         return
-    learned = f"{plural(state['trial'], 'trial')} learned, {plural(agent.net.n_rules, 'rule')}"
-    print(f"{path}: {learned}")
+    print(learned(agent, path, state))
     reading = explain.read(agent)
     if options.at:
         x, y, degrees = options.at
