@@ -19,9 +19,9 @@ from learning import SIZES, both_passes, decide, fill, learner, states
 from timing import arguments, interleaved, median, ratio, report
 from torch import Tensor
 
-from sofnn_torch.session import arithmetic
-from sofnn_torch.sga import SGA, surprise
-from sofnn_torch.sofnn import SOFNN
+from sofnn_torch.learners.sga import SGA, surprise
+from sofnn_torch.network.sofnn import SOFNN
+from sofnn_torch.runs.session import arithmetic
 
 
 class Decision:

@@ -22,10 +22,10 @@ import torch
 from timing import arguments, interleaved, median, ratio, report
 from torch import Tensor
 
-from sofnn_torch.factory import Agent, make_agent
-from sofnn_torch.presets import preset
-from sofnn_torch.session import arithmetic
-from sofnn_torch.sofnn import SOFNN
+from sofnn_torch.network.sofnn import SOFNN
+from sofnn_torch.runs.factory import Agent, make_agent
+from sofnn_torch.runs.presets import preset
+from sofnn_torch.runs.session import arithmetic
 
 SIZES = (1_000, 10_000)
 GROWTH = (10, 30, 100, 300, 1_000, 3_000, 10_000, 30_000, 100_000)

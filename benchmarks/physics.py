@@ -18,9 +18,9 @@ import mujoco
 import numpy as np
 from timing import arguments, median, ratio, report
 
-from sofnn_torch.odometry import MotorNoise, wrap_angle
-from sofnn_torch.optimum import optimal_steps
-from sofnn_torch.physics import Physics, default_model_path
+from sofnn_torch.maze.odometry import MotorNoise, wrap_angle
+from sofnn_torch.maze.optimum import optimal_steps
+from sofnn_torch.maze.robot import Physics, default_model_path
 
 STRAIGHT, LEFT, RIGHT = (0.010, 0.010), (-0.004, 0.004), (0.004, -0.004)
 Change = Callable[[mujoco.MjSpec], None]

@@ -18,10 +18,11 @@ import numpy as np
 import psutil
 import tyro
 
-from sofnn_torch import figures, training
-from sofnn_torch.guard import Interrupted
-from sofnn_torch.presets import preset
-from sofnn_torch.session import RunOptions
+from sofnn_torch import training
+from sofnn_torch.pictures import figures
+from sofnn_torch.runs.presets import preset
+from sofnn_torch.runs.session import RunOptions
+from sofnn_torch.runs.signals import Interrupted
 
 
 @dataclass(frozen=True)

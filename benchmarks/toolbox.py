@@ -20,8 +20,8 @@ from neuro_fuzzy_toolbox.func import Gaussian_MF
 from neuro_fuzzy_toolbox.models.anfis import rule_reduced_ANFIS
 from timing import arguments, interleaved, median, ratio, report
 
-from sofnn_torch.session import arithmetic
-from sofnn_torch.sofnn import SOFNN
+from sofnn_torch.network.sofnn import SOFNN
+from sofnn_torch.runs.session import arithmetic
 
 
 def ours(rules: int, period: float = 0.0) -> SOFNN:

@@ -29,12 +29,13 @@ from learning import SIZES, fill, minimal
 from physics import VARIANTS
 from timing import arguments, median, ratio, report
 
-from sofnn_torch import session, training
-from sofnn_torch.guard import SignalTrap
-from sofnn_torch.odometry import WHEEL_RADIUS
-from sofnn_torch.physics import Physics
-from sofnn_torch.presets import preset
-from sofnn_torch.session import RunOptions, Session, arithmetic
+from sofnn_torch import training
+from sofnn_torch.maze.odometry import WHEEL_RADIUS
+from sofnn_torch.maze.robot import Physics
+from sofnn_torch.runs import session
+from sofnn_torch.runs.presets import preset
+from sofnn_torch.runs.session import RunOptions, Session, arithmetic
+from sofnn_torch.runs.signals import SignalTrap
 
 MAX_STEPS = 2_000  # of a trial
 Commands = list[list[tuple[float, float]]]  # of both wheels [rad/s], trial by trial

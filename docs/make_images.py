@@ -6,13 +6,13 @@ from typing import Annotated
 
 import tyro
 
-from sofnn_torch import figures
 from sofnn_torch.evaluate import load
-from sofnn_torch.factory import make_env
-from sofnn_torch.flags import command
-from sofnn_torch.physics import load_model
-from sofnn_torch.policy import FrozenPolicy
-from sofnn_torch.rendering import OffscreenRenderer
+from sofnn_torch.learners.frozen import FrozenPolicy
+from sofnn_torch.maze.rendering import OffscreenRenderer
+from sofnn_torch.maze.robot import load_model
+from sofnn_torch.pictures import figures
+from sofnn_torch.runs.factory import make_env
+from sofnn_torch.terminal import command
 
 OUT = Path(__file__).parent / "images"
 SIZE = 840  # pixels of a rendered picture

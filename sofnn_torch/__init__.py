@@ -20,4 +20,4 @@ except Exception as error:  # MuJoCo looks at MUJOCO_GL when it loads and then r
     )
     sys.exit(2)  # nothing works without it, and every command ends here in one line
 
-register(id="KheperaMaze-v0", entry_point="sofnn_torch.maze:KheperaMazeEnv")
+register(id="KheperaMaze-v0", entry_point="sofnn_torch.maze.env:KheperaMazeEnv")

@@ -18,13 +18,15 @@ import tyro
 if __name__ == "__main__":  # Ctrl-C while libraries load: there is nothing to save yet
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
-from sofnn_torch import runs, seeds, training
-from sofnn_torch.config import Config
-from sofnn_torch.flags import output
-from sofnn_torch.flags import parse as parse_flags
-from sofnn_torch.guard import Divergence, Interrupted
-from sofnn_torch.presets import preset
-from sofnn_torch.session import RunOptions, home_of, saved_config
+from sofnn_torch import training
+from sofnn_torch.runs import directory, parallel
+from sofnn_torch.runs.guard import Divergence
+from sofnn_torch.runs.presets import preset
+from sofnn_torch.runs.session import RunOptions, home_of, saved_config
+from sofnn_torch.runs.settings import Config
+from sofnn_torch.runs.signals import Interrupted
+from sofnn_torch.terminal import output, say
+from sofnn_torch.terminal import parse as parse_flags
 
 EXAMPLES = """Train a robot to find its way with a self-organizing fuzzy neural network.
 
@@ -64,7 +66,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             if flags.replay:
                 training.replay(flags.replay)
             elif flags.seeds is not None:
-                return seeds.train(flags.config, flags.options, flags.seeds, flags.workers, argv)
+                return parallel.train(flags.config, flags.options, flags.seeds, flags.workers, argv)
             elif flags.resume:
                 run = training.resume(flags.resume, flags.options, flags.config.trials)
                 print(f"{run}: done")
@@ -76,7 +78,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _fail(error, 1)
     except Interrupted as stop:
         if stop.run:
-            runs.say(f"stopped and saved; go on with: {_program()} --resume {stop.run}")
+            say(f"stopped and saved; go on with: {_program()} --resume {stop.run}")
         return 128 + stop.number
     return 0
 
@@ -130,7 +132,7 @@ def _keep_settings(flags: Flags, base: Config) -> None:
         raise ValueError(f"--{min(moved)} is for new runs; a resumed run keeps its directory")
     asked = dataclasses.replace(flags.config, trials=base.trials)
     for name in _changes(asked, base):
-        ours, theirs = (runs.flatten(dataclasses.asdict(c))[name] for c in (asked, base))
+        ours, theirs = (directory.flatten(dataclasses.asdict(c))[name] for c in (asked, base))
         raise ValueError(
             f"{_flag(name)} {ours} contradicts {flags.resume}, which has {theirs}: "
             "a run keeps its settings; only --trials may be raised"
@@ -151,7 +153,7 @@ def _refuse_idle(flags: Flags, base: Flags) -> None:
 
 def _changes(ours: Any, theirs: Any) -> list[str]:
     """Names of the settings that differ."""
-    a, b = (runs.flatten(dataclasses.asdict(settings)) for settings in (ours, theirs))
+    a, b = (directory.flatten(dataclasses.asdict(settings)) for settings in (ours, theirs))
     changed = [name for name in a if a[name] != b[name]]
     return [name.removeprefix("config.").removeprefix("options.") for name in changed]
 

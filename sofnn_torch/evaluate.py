@@ -26,14 +26,15 @@ from rich.console import Console
 from rich.table import Table
 from scipy import stats
 
-from sofnn_torch import checkpoint
-from sofnn_torch.config import Config
-from sofnn_torch.factory import Agent, make_agent, make_env
-from sofnn_torch.flags import command
-from sofnn_torch.monitoring import TrialRecord, film, gif
-from sofnn_torch.optimum import optimal_steps
-from sofnn_torch.runs import plural, same_settings, say, versions
-from sofnn_torch.session import arithmetic, saved_config
+from sofnn_torch.maze.optimum import optimal_steps
+from sofnn_torch.pictures.film import film, gif
+from sofnn_torch.runs import checkpoint
+from sofnn_torch.runs.directory import same_settings, versions
+from sofnn_torch.runs.factory import Agent, make_agent, make_env
+from sofnn_torch.runs.session import arithmetic, saved_config
+from sofnn_torch.runs.settings import Config
+from sofnn_torch.runs.trial import TrialRecord
+from sofnn_torch.terminal import command, plural, say
 from sofnn_torch.training import play
 
 CONFIDENCE = 0.95

@@ -14,14 +14,16 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from sofnn_torch import checkpoint, session
-from sofnn_torch.config import Config, from_dict
-from sofnn_torch.factory import Agent
-from sofnn_torch.guard import Divergence, Interrupted, SignalTrap, diagnose, physics_warnings
-from sofnn_torch.monitoring import Monitor, Trajectory, TrialRecord
-from sofnn_torch.policy import FrozenPolicy
-from sofnn_torch.runs import plural, say
-from sofnn_torch.session import RunOptions, Session, arithmetic, environment_seed
+from sofnn_torch.learners.frozen import FrozenPolicy
+from sofnn_torch.pictures.tensorboard import Monitor
+from sofnn_torch.runs import checkpoint, session
+from sofnn_torch.runs.factory import Agent
+from sofnn_torch.runs.guard import Divergence, diagnose, physics_warnings
+from sofnn_torch.runs.session import RunOptions, Session, arithmetic, environment_seed
+from sofnn_torch.runs.settings import Config, from_dict
+from sofnn_torch.runs.signals import Interrupted, SignalTrap
+from sofnn_torch.runs.trial import Trajectory, TrialRecord
+from sofnn_torch.terminal import plural, say
 
 __all__ = ["RunOptions", "environment_seed", "play", "replay", "resume", "train"]
 

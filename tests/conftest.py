@@ -7,9 +7,9 @@ import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from sofnn_torch import checkpoint
-from sofnn_torch.config import Config
-from sofnn_torch.presets import preset
+from sofnn_torch.runs import checkpoint
+from sofnn_torch.runs.presets import preset
+from sofnn_torch.runs.settings import Config
 from sofnn_torch.training import RunOptions
 
 torch.set_num_threads(1)

@@ -9,9 +9,9 @@ import sys
 from pathlib import Path
 
 from sofnn_torch import training
-from sofnn_torch.config import Config
-from sofnn_torch.guard import Interrupted
-from sofnn_torch.maze import KheperaMazeEnv
+from sofnn_torch.maze.env import KheperaMazeEnv
+from sofnn_torch.runs.settings import Config
+from sofnn_torch.runs.signals import Interrupted
 from sofnn_torch.training import RunOptions
 
 FILE_EVENTS = {"open", "os.rename", "os.remove"}

@@ -15,7 +15,7 @@ import learning
 import neighbours
 import training
 
-from sofnn_torch.sofnn import SOFNN
+from sofnn_torch.network.sofnn import SOFNN
 
 
 def test_training_is_measured_for_both_learners_and_both_physics(tmp_path, monkeypatch, capsys):

@@ -14,11 +14,12 @@ from hypothesis import given
 from hypothesis import settings as trials_of
 from hypothesis import strategies as st
 
-from sofnn_torch import checkpoint, training
-from sofnn_torch.checkpoint import CheckpointError
+from sofnn_torch import training
 from sofnn_torch.cli import main
-from sofnn_torch.factory import make_agent, make_env
-from sofnn_torch.runs import Run
+from sofnn_torch.runs import checkpoint
+from sofnn_torch.runs.checkpoint import CheckpointError
+from sofnn_torch.runs.directory import Run
+from sofnn_torch.runs.factory import make_agent, make_env
 
 
 @pytest.fixture(scope="module")

@@ -18,12 +18,13 @@ from conftest import settings as short
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
-from sofnn_torch import checkpoint, cli, flags, seeds, training
+from sofnn_torch import cli, terminal, training
 from sofnn_torch.cli import main, parse
-from sofnn_torch.config import Config, from_dict
-from sofnn_torch.factory import make_agent
-from sofnn_torch.presets import preset
-from sofnn_torch.runs import load_config
+from sofnn_torch.runs import checkpoint, parallel
+from sofnn_torch.runs.directory import load_config
+from sofnn_torch.runs.factory import make_agent
+from sofnn_torch.runs.presets import preset
+from sofnn_torch.runs.settings import Config, from_dict
 
 ROOT = Path(__file__).parents[1]
 QUICK = ["--quiet", "--picture-every=0", "--video-every=0", "--maze.max-steps=100"]
@@ -138,7 +139,7 @@ def test_a_bad_mujoco_gl_is_one_line(here):
 def test_what_an_encoding_lacks_prints_as_question_marks(monkeypatch):
     buffer = io.BytesIO()
     monkeypatch.setattr("sys.stdout", io.TextIOWrapper(buffer, encoding="ascii"))
-    with flags.output():
+    with terminal.output():
         print("150 ± 60 mm")
     assert buffer.getvalue() == b"150 ? 60 mm\n"
 
@@ -352,7 +353,7 @@ def test_several_seeds_in_one_call(here, capsys):
 
 def test_a_crash_of_one_seed_leaves_the_others(here, capsys, monkeypatch):
     """The process of one seed is killed as soon as its run is there."""
-    real = seeds.subprocess.Popen
+    real = parallel.subprocess.Popen
 
     def popen(command, **keywords):
         child = real(command, **keywords)
@@ -360,7 +361,7 @@ def test_a_crash_of_one_seed_leaves_the_others(here, capsys, monkeypatch):
             child.kill()
         return child
 
-    monkeypatch.setattr(seeds.subprocess, "Popen", popen)
+    monkeypatch.setattr(parallel.subprocess, "Popen", popen)
     assert main(["--seeds", "0-1", "--workers", "2", "--trials", "1", *QUICK]) == 1
     out, err = capsys.readouterr()
     assert out == "runs/sga-sofnn-estimated-s0: done\n"
@@ -393,7 +394,7 @@ def test_a_signal_stops_all_seeds_after_saving(here):
     "text,expected", [("0-3", [0, 1, 2, 3]), ("5", [5]), ("0,3,5-6", [0, 3, 5, 6])]
 )
 def test_lists_of_seeds(text, expected):
-    assert seeds.parse(text) == expected
+    assert parallel.parse(text) == expected
 
 
 # ------------------------------------------------------------------------------------------- fuzz

@@ -11,10 +11,10 @@ import imageio.v3 as imageio
 import numpy as np
 import pytest
 
-from sofnn_torch import evaluate, flags
-from sofnn_torch.monitoring import TrialRecord
-from sofnn_torch.presets import preset
-from sofnn_torch.rendering import RenderingError
+from sofnn_torch import evaluate, terminal
+from sofnn_torch.maze.rendering import RenderingError
+from sofnn_torch.runs.presets import preset
+from sofnn_torch.runs.trial import TrialRecord
 from sofnn_torch.training import RunOptions, train
 
 RECORD = TrialRecord(1, 500, 60, 500, 1.0, True, 1, 2, 100, 0.003, 0.01, 0.02)
@@ -235,4 +235,4 @@ def test_a_checkpoint_of_other_settings_is_refused(trained, tmp_path, monkeypatc
     ],
 )
 def test_framed_messages_become_one_line_with_any_encoding(framed):
-    assert flags._first_message(framed) == "Unrecognized options: --n; did you mean --name?"
+    assert terminal._first_message(framed) == "Unrecognized options: --n; did you mean --name?"

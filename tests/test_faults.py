@@ -18,11 +18,14 @@ import pytest
 import torch
 from conftest import equal, quick_options, settings
 
-from sofnn_torch import checkpoint, monitoring, training
-from sofnn_torch.checkpoint import CheckpointError
-from sofnn_torch.factory import make_agent, make_env
-from sofnn_torch.guard import Divergence, Interrupted
-from sofnn_torch.runs import Run, default_name, load_config
+from sofnn_torch import training
+from sofnn_torch.pictures import tensorboard
+from sofnn_torch.runs import checkpoint
+from sofnn_torch.runs.checkpoint import CheckpointError
+from sofnn_torch.runs.directory import Run, default_name, load_config
+from sofnn_torch.runs.factory import make_agent, make_env
+from sofnn_torch.runs.guard import Divergence
+from sofnn_torch.runs.signals import Interrupted
 from sofnn_torch.training import play
 
 NAME = default_name(settings())
@@ -315,7 +318,7 @@ def test_training_goes_on_without_tensorboard(options, reference, monkeypatch, c
     def refuse(*_, **__):
         raise PermissionError(errno.EACCES, "Permission denied")
 
-    monkeypatch.setattr(monitoring, "EventFile", refuse)
+    monkeypatch.setattr(tensorboard, "EventFile", refuse)
     run = training.train(settings(), options)
     same_end(run, reference)
     (line,) = warnings(capsys)
@@ -326,7 +329,7 @@ def test_training_goes_on_without_gl(options, reference, monkeypatch, capsys):
     def refuse(*_, **__):
         raise RuntimeError("no GL context")
 
-    monkeypatch.setattr(monitoring, "film", refuse)
+    monkeypatch.setattr(tensorboard, "film", refuse)
     run = training.train(settings(), dataclasses.replace(options, video_every=1))
     same_end(run, reference)
     (line,) = warnings(capsys)

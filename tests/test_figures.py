@@ -10,11 +10,11 @@ import torch
 from matplotlib.patches import Rectangle
 from PIL import Image
 
-from sofnn_torch import figures
-from sofnn_torch.factory import make_agent, make_env
-from sofnn_torch.monitoring import Trajectory
-from sofnn_torch.presets import preset
-from sofnn_torch.survey import survey, usage
+from sofnn_torch.learners.survey import survey, usage
+from sofnn_torch.pictures import figures
+from sofnn_torch.runs.factory import make_agent, make_env
+from sofnn_torch.runs.presets import preset
+from sofnn_torch.runs.trial import Trajectory
 
 RNG = np.random.default_rng(7)
 STATES = np.column_stack([RNG.uniform(0, 1, (60, 2)), RNG.uniform(-math.pi, math.pi, 60)])

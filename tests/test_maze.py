@@ -11,7 +11,7 @@ import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
 
-from sofnn_torch.maze import LEFT, RIGHT, STRAIGHT, KheperaMazeEnv
+from sofnn_torch.maze.env import LEFT, RIGHT, STRAIGHT, KheperaMazeEnv
 
 
 @pytest.mark.parametrize(

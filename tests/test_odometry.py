@@ -6,8 +6,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from sofnn_torch.maze import LEFT, RIGHT, STRAIGHT, KheperaMazeEnv
-from sofnn_torch.odometry import (
+from sofnn_torch.maze.env import LEFT, RIGHT, STRAIGHT, KheperaMazeEnv
+from sofnn_torch.maze.odometry import (
     DRAG,
     DeadReckoning,
     MotorNoise,
@@ -15,7 +15,7 @@ from sofnn_torch.odometry import (
     differential_drive,
     wrap_angle,
 )
-from sofnn_torch.physics import default_model_path
+from sofnn_torch.maze.robot import default_model_path
 
 QUARTER = 0.5 * math.pi
 

@@ -8,10 +8,10 @@ import sys
 import numpy as np
 import pytest
 
-from sofnn_torch import optimum
-from sofnn_torch.maze import KheperaMazeEnv
-from sofnn_torch.optimum import STEP_LENGTH, STEP_TURN, optimal_steps
-from sofnn_torch.physics import MazePlan, Physics
+from sofnn_torch.maze import optimum
+from sofnn_torch.maze.env import KheperaMazeEnv
+from sofnn_torch.maze.optimum import STEP_LENGTH, STEP_TURN, optimal_steps
+from sofnn_torch.maze.robot import MazePlan, Physics
 
 
 @pytest.fixture(scope="module")
@@ -63,9 +63,9 @@ def test_an_unreachable_goal_is_an_error():
 
 
 def test_the_help_is_that_of_the_command():
-    command = [sys.executable, "-m", "sofnn_torch.optimum", "--help"]
+    command = [sys.executable, "-m", "sofnn_torch.maze.optimum", "--help"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120)
-    assert done.returncode == 0 and "usage: python -m sofnn_torch.optimum" in done.stdout
+    assert done.returncode == 0 and "usage: python -m sofnn_torch.maze.optimum" in done.stdout
 
 
 def test_unknown_flags_are_refused(monkeypatch, capsys):

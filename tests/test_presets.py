@@ -7,9 +7,9 @@ import pytest
 import torch
 from conftest import settings
 
-from sofnn_torch.factory import make_agent
-from sofnn_torch.presets import preset
-from sofnn_torch.runs import flatten
+from sofnn_torch.runs.directory import flatten
+from sofnn_torch.runs.factory import make_agent
+from sofnn_torch.runs.presets import preset
 
 # Section 5, as printed; a decay of 1 is equation 6, of 0 are equations 12-15.
 PRINTED = {

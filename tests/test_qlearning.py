@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from sofnn_torch.qlearning import QConfig, QLearning, code_length
-from sofnn_torch.sofnn import SOFNN
+from sofnn_torch.learners.qlearning import QConfig, QLearning, code_length
+from sofnn_torch.network.sofnn import SOFNN
 
 N, TAU = 3, 2 * math.pi
 CODINGS = ["scalar", "wheels", "onehot", "antecedent"]

@@ -11,10 +11,10 @@ import numpy as np
 import psutil
 import pytest
 
-from sofnn_torch import rendering
-from sofnn_torch.maze import STRAIGHT, KheperaMazeEnv
-from sofnn_torch.physics import load_model
-from sofnn_torch.rendering import OffscreenRenderer, RenderingError, Viewer
+from sofnn_torch.maze import rendering
+from sofnn_torch.maze.env import STRAIGHT, KheperaMazeEnv
+from sofnn_torch.maze.rendering import OffscreenRenderer, RenderingError, Viewer
+from sofnn_torch.maze.robot import load_model
 
 
 def can_draw():

@@ -13,7 +13,7 @@ import pytest
 from conftest import assert_same_run, quick_options, settings
 from tensorboard import program
 
-from sofnn_torch.runs import default_name
+from sofnn_torch.runs.directory import default_name
 
 # Both learners on a growing network, with every kind of pose.
 GROWING = {

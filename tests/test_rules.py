@@ -19,10 +19,13 @@ from hypothesis import strategies as st
 from PIL import Image
 from rich.console import Console
 
-from sofnn_torch import checkpoint, evaluate, explain, rulefiles, rules, training
-from sofnn_torch.factory import make_agent
-from sofnn_torch.runs import load_config
-from sofnn_torch.sofnn import SOFNN
+from sofnn_torch import evaluate, training
+from sofnn_torch.network.sofnn import SOFNN
+from sofnn_torch.rules import __main__ as rules
+from sofnn_torch.rules import files, words
+from sofnn_torch.runs import checkpoint
+from sofnn_torch.runs.directory import load_config
+from sofnn_torch.runs.factory import make_agent
 
 SHORT = {"max_steps": 80}
 ADAPT = {"rate_centre": 0.001, "rate_width": 0.001}  # numbers with all their digits
@@ -90,9 +93,9 @@ def parameters(agent):
 
 def written(agent, path, table=None):
     """Write rules to a file: those of the learner if no others are given."""
-    write = rulefiles.to_json if path.suffix == ".json" else rulefiles.to_csv
+    write = files.to_json if path.suffix == ".json" else files.to_csv
     table = parameters(agent) if table is None else table
-    path.write_bytes(write(rulefiles.schema(agent), table, {"usage": [0.5] * len(table)}))
+    path.write_bytes(write(files.schema(agent), table, {"usage": [0.5] * len(table)}))
     return path
 
 
@@ -106,8 +109,8 @@ STATES = np.random.default_rng(0).uniform([0, 0, -4], [1, 1, 4], (20, 3)).astype
 @pytest.mark.parametrize("suffix", [".json", ".csv"])
 def test_rules_come_back_bit_for_bit(trained, tmp_path, variant, suffix):
     _, agent, _, _ = evaluate.load(trained(variant))
-    kind, before = rulefiles.schema(agent), agent.net.table().detach().clone()
-    table = rulefiles.read(written(agent, tmp_path / f"rules{suffix}"), kind)
+    kind, before = files.schema(agent), agent.net.table().detach().clone()
+    table = files.read(written(agent, tmp_path / f"rules{suffix}"), kind)
     assert table.tobytes() == parameters(agent).tobytes()
     answers = [agent.act(state) for state in STATES]
     labels = agent.net.labels.clone()
@@ -121,9 +124,9 @@ def test_every_float_survives():
     bits = np.random.default_rng(1).integers(0, 2**32, 100_000, np.uint32)
     numbers = bits.view(np.float32)
     numbers = np.append(numbers[np.isfinite(numbers)], np.float32([0.0, -0.0, 0.1, 2**24 + 2]))
-    texts = list(map(repr, rulefiles.shortest(numbers).tolist()))
+    texts = list(map(repr, files.shortest(numbers).tolist()))
     assert np.float32(list(map(float, texts))).tobytes() == numbers.tobytes()
-    assert rulefiles.shortest(np.float32([0.06, -0.45])).tolist() == [0.06, -0.45]
+    assert files.shortest(np.float32([0.06, -0.45])).tolist() == [0.06, -0.45]
 
 
 def test_a_checkpoint_file_stands_for_its_run(run, tmp_path, call):
@@ -215,7 +218,7 @@ def test_rules_may_be_changed_dropped_and_added(run, tmp_path, call, mean, actio
     assert np.array_equal(parameters(after)[:-1], parameters(before)[1:])
     assert after.act(np.float32([0.9, 0.9, 3.0])) == action  # no other rule is near
     assert (
-        f"action: {explain.TURNS[action]}"
+        f"action: {words.TURNS[action]}"
         in call(run.with_name("run-edited"), "--at", 0.9, 0.9, math.degrees(3.0))[1]
     )
 
@@ -302,7 +305,7 @@ def printed(view, width=100):
 
 def test_the_table_of_two_rules():
     learner = small((0.5, 0.1, 0.65), (-0.25, 0.3, -0.001))
-    said = explain.read(learner)
+    said = words.read(learner)
     text = printed(rules.table(said, np.array([0.25, 0.75]), top=20))
     *_, second, first = [line.split() for line in text.splitlines() if "±" in line]
     width = round(math.degrees(0.45))
@@ -323,7 +326,7 @@ def test_a_rule_that_all_rules_together_overrule_is_marked():
     learner = small(
         (1.0, 0.1, 0.0), (-0.5, 0.1, 0.0), (0.1, 0.1, 0.0), at=[here, here, (0, 0, 0.0)]
     )
-    said = explain.read(learner)
+    said = words.read(learner)
     assert said.consequents[""] == ["left turn", "right turn", "straight"]
     assert said.outvoted.tolist() == [True, True, False]
     assert printed(rules.table(said, np.ones(3), 0)).count("turn * ") == 2
@@ -339,9 +342,9 @@ def test_the_values_of_q_learning():
     # f(x, a) = c_x . x + c_a . a + c at x = (0.15, 0.25, 0): 1 * 0.25 + c_a + 0.5
     at = [(0.15, 0.25, 0.0), (0.8, 0.8, 0.0)]
     learner = small((0.0, 1, 0, 3, 1, 2, 0.5), (0.0, 0, 0, 0, 0, 0, 65), agent="q", at=at)
-    said = explain.read(learner).consequents
+    said = words.read(learner).consequents
     assert said[""] == ["right turn", "undecided"]
-    assert [said[f"Q {name}"][0] for name in explain.TURNS] == ["3.75", "1.75", "2.75"]
+    assert [said[f"Q {name}"][0] for name in words.TURNS] == ["3.75", "1.75", "2.75"]
 
 
 def test_an_action_among_the_antecedents():
@@ -349,7 +352,7 @@ def test_an_action_among_the_antecedents():
     at = [(0.15, 0.25, 0.0, 1.0), (0.15, 0.25, 0.0, -1.0)]
     numbers = [(0.0, 0, 0, 0.5, 2), (0.0, 0, 0, 0, 1)]
     learner = small(*numbers, agent="q", at=at, q={"coding": "antecedent"})
-    said = explain.read(learner)
+    said = words.read(learner)
     assert said.antecedents["action"] == ["1.00 ± 0.30", "-1.00 ± 0.30"]
     assert said.consequents == {"Q": ["2.50", "1.00"], "best there": ["left turn"] * 2}
 
@@ -359,15 +362,15 @@ def test_an_action_among_the_antecedents():
     [(0, "0° E"), (44, "44° NE"), (90, "90° N"), (180, "180° W"), (-91, "-91° S"), (359, "-1° E")],
 )
 def test_directions(degrees, text):
-    assert explain.bearing(math.radians(degrees)) == text
+    assert words.bearing(math.radians(degrees)) == text
 
 
 @each_variant
 def test_the_rules_at_a_state_add_up_to_what_the_learner_says(trained, variant):
     config, agent, _, _ = evaluate.load(trained(variant))
-    said = explain.read(agent)
+    said = words.read(agent)
     for state in STATES[:5]:
-        decision = explain.decide(agent, state)
+        decision = words.decide(agent, state)
         x = torch.from_numpy(state)
         with torch.no_grad():
             if config.agent == "sga":
@@ -379,7 +382,7 @@ def test_the_rules_at_a_state_add_up_to_what_the_learner_says(trained, variant):
         assert decision.shares.sum(0) == pytest.approx(1.0, abs=1e-5)
         action = agent.act(state)
         if agent.config.actions == "three":
-            assert decision.action == explain.TURNS[action]
+            assert decision.action == words.TURNS[action]
         else:
             assert f"{action[-1]:.2f}".replace("-0.00", "0.00") in decision.action
             assert chosen is None or f"{chosen:.2f}" in decision.action
@@ -388,7 +391,7 @@ def test_the_rules_at_a_state_add_up_to_what_the_learner_says(trained, variant):
         total = sum(float(words[1].rstrip("%")) for words in shown)
         assert 98.5 < total < 100.5
         # Every column but the last rules' is the weighted mean of what is shown.
-        if len(decision.names) <= explain.MANY:
+        if len(decision.names) <= words.MANY:
             last = text.splitlines()[-2].split()[2:]
             assert list(map(float, last)) == pytest.approx(decision.outputs, abs=0.006)
 
@@ -432,7 +435,7 @@ def test_ten_thousand_rules_are_read_at_once(monkeypatch):
         return real(*arguments)
 
     monkeypatch.setattr(agent.net, "normalised_firing", counted)
-    assert len(explain.read(agent).sentences()) == count
+    assert len(words.read(agent).sentences()) == count
     assert calls <= 2 + count // 512
 
 
@@ -596,13 +599,13 @@ def test_a_bad_rule_file_gives_one_line_and_nothing_is_written(few, tmp_path, ca
 def test_names_that_an_object_has_twice_are_refused(few, tmp_path):
     _, agent, *_ = few
     file = written(agent, tmp_path / "rules.json")
-    text, kind = file.read_text(), rulefiles.schema(agent)
+    text, kind = file.read_text(), files.schema(agent)
     file.write_text(text.replace('"usage"', '"width": [1, 1, 1], "usage"', 1))
     with pytest.raises(ValueError, match=r'rules.json: rule 1: "width" is there twice'):
-        rulefiles.read(file, kind)
+        files.read(file, kind)
     file.write_text(text.replace('"version"', '"agent": "sga", "version"', 1))
     with pytest.raises(ValueError, match=r'rules.json: "agent" is there twice'):
-        rulefiles.read(file, kind)
+        files.read(file, kind)
 
 
 def test_a_fixed_network_keeps_its_number_of_rules(trained, tmp_path, call):
@@ -746,7 +749,7 @@ def test_broken_files_load_whole_or_not_at_all(few, tmp_path, monkeypatch, suffi
     rule_file = tmp_path / f"rules{suffix}"
     text = written(agent, rule_file, parameters(agent)[:3]).read_text()
     before, outcomes = contents(path.parent), {"accepted": 0, "refused": 0}
-    agent, kind = copy.deepcopy(agent), rulefiles.schema(agent)
+    agent, kind = copy.deepcopy(agent), files.schema(agent)
 
     def create(*_):
         raise Accepted

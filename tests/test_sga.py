@@ -9,8 +9,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sofnn_torch.sga import LEFT, RIGHT, SGA, STRAIGHT, SGAConfig, log_likelihood
-from sofnn_torch.sofnn import SOFNN
+from sofnn_torch.learners.sga import LEFT, RIGHT, SGA, STRAIGHT, SGAConfig, log_likelihood
+from sofnn_torch.network.sofnn import SOFNN
 
 N, TAU = 3, 2 * math.pi
 ADAPTIVE = {"rate_centre": 1e-3, "rate_width": 1e-3, "rate_mean": 0.05, "rate_deviation": 1e-3}

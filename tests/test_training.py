@@ -15,10 +15,11 @@ import pytest
 import torch
 from conftest import equal, quick_options, scalars, settings
 
-from sofnn_torch import checkpoint, training
-from sofnn_torch.factory import make_env
-from sofnn_torch.runs import load_config
-from sofnn_torch.session import arithmetic, build
+from sofnn_torch import training
+from sofnn_torch.runs import checkpoint
+from sofnn_torch.runs.directory import load_config
+from sofnn_torch.runs.factory import make_env
+from sofnn_torch.runs.session import arithmetic, build
 from sofnn_torch.training import RunOptions, play
 
 

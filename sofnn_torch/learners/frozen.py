@@ -1,0 +1,37 @@
+"""A learned policy that plays a trial without learning, and does not run in circles."""
+
+from collections import Counter
+
+import numpy as np
+
+from sofnn_torch.runs.factory import Agent
+
+PATIENCE = 4  # decisions at a rule that a sound way may need: a turn, a coarse grid
+MOST = 10  # doublings: by then every action is about as likely
+
+
+class FrozenPolicy:
+    """The policy of a learner, for one trial.
+
+    While a robot learns, values that lead it in a circle or against a wall are soon corrected.
+    Frozen values are not, and a policy without chance would go on for ever. But to decide again and
+    again where the same rule fires most says that they are wrong by more than the present chance
+    covers: with each such decision after the fourth the learned standard deviation (eq. 5), or
+    temperature (eq. 11), is added 1, 3, 7, ... times at that rule until the end of the trial. A
+    policy that goes straight to the goal leaves a rule sooner and is not changed by this.
+
+    Args:
+        agent: the learner; only its random generator moves.
+        explore: begin with the learned stochastic policy instead of the mean or greedy action.
+    """
+
+    def __init__(self, agent: Agent, explore: bool = False):
+        self.agent, self.explore = agent, explore
+        self.visits: Counter[int] = Counter()
+
+    def act(self, observation: np.ndarray) -> int | np.ndarray:
+        """The action at an observation (n,)."""
+        rule = self.agent.strongest_rule(observation)
+        self.visits[rule] += 1
+        doublings = min(max(self.visits[rule] - PATIENCE, 0), MOST)
+        return self.agent.act(observation, self.explore + 2**doublings - 1)

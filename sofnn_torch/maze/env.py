@@ -1,0 +1,333 @@
+"""The Khepera in its maze as a Gymnasium environment: decisions, rewards, pose estimates."""
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from sofnn_torch.maze.odometry import STEP_SECONDS, WHEEL_BASE, DeadReckoning, MotorNoise, Pose
+from sofnn_torch.maze.rendering import OffscreenRenderer, Viewer
+from sofnn_torch.maze.robot import INFRARED_RANGE, MazePlan, Physics, load_model
+
+__all__ = ["KheperaMazeEnv", "MazePlan", "Physics"]
+
+FORWARD_SPEED = 0.010  # m/s of both wheels: the paper's (10, 10) mm/s, 5 mm per step
+TURN_SPEED = 0.004  # m/s of each wheel: the paper's (-4, 4) mm/s, 0.08 rad per step
+RIGHT, STRAIGHT, LEFT = range(3)
+START, GOAL = -2, -1  # zones; the others are the numbers of sub-goals
+
+
+class KheperaMazeEnv(gymnasium.Env[np.ndarray, Any]):
+    """Drive from the start to the goal of the maze.
+
+    One `step` is one decision: the action is held for `hold` simulator steps of 0.5 s, or until
+    the robot bumps into a wall, reaches the goal or runs out of steps.
+
+    Observation, float32 (3,): x [m], y [m], heading [rad, in [-pi, pi)] by the chosen `pose`:
+    "estimated" adds up commanded movements, "odometry" wheel encoders, "true" is the simulated
+    robot's. With `range_sensors` (12,): 8 infrared ranges [m] and the bumper (0 or 1) follow.
+
+    Actions: "three" is Discrete(3), the paper's right turn (0), straight (1), left turn (2).
+    "steer" is Box(1,) from -1 (right turn) over 0 (straight) to 1 (left turn). "wheels" is Box(2,),
+    left and right wheel speed in units of 10 mm/s.
+
+    Rewards add up over a decision: `goal_reward` at the goal, where the trial ends,
+    `collision_reward` for a bump, `subgoal_reward` for each sub-goal, once a trial, and
+    `step_reward` for the decision itself.
+    """
+
+    metadata = {"render_modes": ["rgb_array", "human"], "render_fps": 10}  # noqa: RUF012
+
+    def __init__(
+        self,
+        pose: str = "estimated",
+        actions: str = "three",
+        hold: int = 10,
+        max_steps: int = 20_000,
+        motor_noise: float = 0.1,
+        wheel_noise: str = "common",
+        dead_reckoning: str = "guarded",
+        goal_reward: float = 1.0,
+        collision_reward: float = -1e-4,
+        subgoal_reward: float = 0.5,
+        step_reward: float = 0.0,
+        wheel_radius_scale: float = 1.0,
+        wheel_base_scale: float = 1.0,
+        range_sensors: bool = False,
+        render_mode: str | None = None,
+        model_path: str | Path | None = None,
+        camera: str = "top",
+        width: int = 480,
+        height: int = 480,
+    ) -> None:
+        """Build the environment.
+
+        Args:
+            pose: "estimated", "odometry" or "true": what the observation holds.
+            actions: "three", "steer" or "wheels".
+            hold: simulator steps for which an action is held.
+            max_steps: trial limit in simulator steps.
+            motor_noise: relative half-width of the uniform motor noise, see `MotorNoise`.
+            wheel_noise: "common" or "independent", see `MotorNoise`.
+            dead_reckoning: "guarded", "still" or "literal", see `DeadReckoning`.
+            goal_reward: reward at the goal.
+            collision_reward: reward for a decision that ends in a bump.
+            subgoal_reward: reward for each sub-goal, once a trial.
+            step_reward: reward for every decision.
+            wheel_radius_scale: wheel radius that dead reckoning believes, over the true one.
+            wheel_base_scale: wheel base that dead reckoning believes, over the true one.
+            range_sensors: add 8 infrared ranges and the bumper to the observation.
+            render_mode: None, "rgb_array" or "human".
+            model_path: another MJCF with the element names of the standard one.
+            camera: "top" or "chase", for "rgb_array".
+            width: of the picture in pixels.
+            height: of the picture in pixels.
+
+        Raises:
+            ValueError: if a setting is unknown or out of range.
+        """
+        _check_choice("pose", pose, ("estimated", "odometry", "true"))
+        _check_choice("actions", actions, ("three", "steer", "wheels"))
+        _check_choice("render_mode", render_mode, (None, *self.metadata["render_modes"]))
+        for name, count in (("hold", hold), ("max_steps", max_steps)):
+            if count < 1 or count != int(count):
+                raise ValueError(f"{name} must be a whole number of at least 1, not {count}")
+        for name, scale in (("radius", wheel_radius_scale), ("base", wheel_base_scale)):
+            if not 0.0 < scale < math.inf:
+                raise ValueError(f"wheel_{name}_scale must be positive, not {scale}")
+        rewards = (goal_reward, collision_reward, subgoal_reward, step_reward)
+        if not all(map(math.isfinite, rewards)):
+            raise ValueError(f"rewards must be finite, not {rewards}")
+
+        self.physics = Physics(model_path)
+        self.model_path, self.camera, self.width, self.height = model_path, camera, width, height
+        self.plan = plan = self.physics.plan
+        self.noise = MotorNoise(motor_noise, wheel_noise)
+        self.estimator = DeadReckoning(
+            dead_reckoning, WHEEL_BASE * wheel_base_scale, self.plan.size
+        )
+        self.pose_mode, self.actions, self.render_mode = pose, actions, render_mode
+        self.hold, self.max_steps = int(hold), int(max_steps)
+        self.goal_reward, self.collision_reward = goal_reward, collision_reward
+        self.subgoal_reward, self.step_reward = subgoal_reward, step_reward
+        self.wheel_radius_scale = wheel_radius_scale
+        self.range_sensors = range_sensors
+        self.action_space = {
+            "three": gymnasium.spaces.Discrete(3),
+            "steer": gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float32),
+            "wheels": gymnasium.spaces.Box(-1.0, 1.0, (2,), np.float32),
+        }[actions]
+        self.observation_space = self._build_observation_space()
+        zones = [(i, centre, plan.subgoal_radius) for i, centre in enumerate(plan.subgoals)]
+        zones += [(START, plan.start[:2], plan.start_radius), (GOAL, plan.goal, plan.goal_radius)]
+        self._zones = [(zone, (*centre, radius * radius)) for zone, centre, radius in zones]
+
+        self.total_steps = 0
+        self.done = True
+        self.subgoals = [False] * len(plan.subgoals)
+        self.trail: list[tuple[float, float]] = []
+        self.on_simulator_step: Callable[[], None] | None = None  # e.g. to record each frame
+        self._renderer: OffscreenRenderer | Viewer | None = None
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Begin a trial at the start, or at `options={"pose": (x, y, heading)}` [m, m, rad].
+
+        Raises:
+            ValueError: if there are other options, or the pose is not free of walls.
+        """
+        super().reset(seed=seed)
+        pose = self._start_pose(options or {})
+        self.physics.place(pose)
+        self.estimator.fix(pose)
+        self.total_steps = 0
+        self.done = False
+        self.subgoals = [False] * len(self.plan.subgoals)
+        self.trail = [pose[:2]]
+        if self.render_mode == "human":
+            self.render()
+        return self._observation(False), self._info(0, False, False)
+
+    def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """Hold an action and return observation, reward, terminated, truncated, info.
+
+        Raises:
+            ValueError: if the action is not in the action space.
+            gymnasium.error.ResetNeeded: if the trial is over.
+        """
+        if self.done:
+            raise gymnasium.error.ResetNeeded("the trial is over: call reset() before step()")
+        left, right = self.wheel_speeds(action)
+        # One draw for a whole decision, however early it ends: fast, and easy to reproduce.
+        draws = iter(self.np_random.random(2 * self.hold).tolist())
+        reward = self.step_reward
+        steps, bumped, success = 0, False, False
+        limit = min(self.hold, self.max_steps - self.total_steps)
+        while steps < limit and not (bumped or success):
+            reward_now, bumped, success = self._simulate(left, right, next(draws), next(draws))
+            reward += reward_now
+            steps += 1
+        self.total_steps += steps
+        truncated = self.total_steps >= self.max_steps and not success
+        self.done = success or truncated
+        info = self._info(steps, bumped, success)
+        return self._observation(bumped), reward, success, truncated, info
+
+    def wheel_speeds(self, action: Any) -> tuple[float, float]:
+        """Return the commanded speeds of the left and right wheel [m/s] for an action."""
+        if self.actions == "three":
+            if action not in (RIGHT, STRAIGHT, LEFT):
+                raise ValueError(f"action must be 0 (right), 1 (straight), 2 (left), not {action}")
+            steer = int(action) - 1.0
+        else:
+            values = np.asarray(action, dtype=np.float64).ravel().tolist()
+            size = self.action_space.shape[0]
+            if len(values) != size or not all(-1.0 <= value <= 1.0 for value in values):
+                raise ValueError(f"action must be {size} numbers in [-1, 1], not {action}")
+            if self.actions == "wheels":
+                return values[0] * FORWARD_SPEED, values[1] * FORWARD_SPEED
+            steer = values[0]
+        forward, turn = FORWARD_SPEED * (1.0 - abs(steer)), TURN_SPEED * steer
+        return forward - turn, forward + turn
+
+    def render(self) -> np.ndarray | None:
+        """Return the view of the maze as an RGB array (height, width, 3), or update the window.
+
+        Shown are the trail of this trial and, as a ghost, where the robot believes to be.
+
+        Raises:
+            RenderingError: if this machine cannot draw.
+        """
+        if self.render_mode is None:
+            gymnasium.logger.warn('render() needs render_mode="rgb_array" or "human"')
+            return None
+        qpos, estimate = self.physics.data.qpos, self.estimator.pose
+        if self._renderer is None:
+            model = load_model(self.model_path)
+            if self.render_mode == "human":
+                self._renderer = Viewer(model)
+            else:
+                self._renderer = OffscreenRenderer(model, self.width, self.height)
+        if self.render_mode == "human":
+            return self._renderer.draw(qpos, self.trail, estimate)
+        return self._renderer.draw(qpos, self.trail, estimate, self.camera)
+
+    def close(self) -> None:
+        """Free the renderer or close the viewer window."""
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the full state as plain numbers and lists; from it the future is bit-identical."""
+        return {
+            "physics": self.physics.state(),
+            "generator": self.np_random.bit_generator.state,
+            "estimate": list(self.estimator.pose),
+            "total_steps": self.total_steps,
+            "done": self.done,
+            "subgoals": list(self.subgoals),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from a state returned by `state_dict` of an environment built alike."""
+        self.physics.set_state(state["physics"])
+        self.np_random.bit_generator.state = state["generator"]
+        self.estimator.pose = tuple(state["estimate"])
+        self.total_steps = state["total_steps"]
+        self.done = state["done"]
+        self.subgoals = list(state["subgoals"])
+        self.trail = [self.physics.position()]
+
+    def _simulate(
+        self, left: float, right: float, first: float, second: float
+    ) -> tuple[float, bool, bool]:
+        """Simulate one step of 0.5 s; return its reward, whether it bumped and reached the goal."""
+        physics, scale = self.physics, self.wheel_radius_scale
+        encoders = physics.wheel_travel() if self.pose_mode == "odometry" else None
+        physics.drive(*self.noise.apply(left, right, first, second))
+        bumped = physics.bumped()
+        x, y = physics.position()
+
+        if encoders is None:
+            rolled_left, rolled_right = left * STEP_SECONDS, right * STEP_SECONDS
+        else:
+            now = physics.wheel_travel()
+            rolled_left, rolled_right = now[0] - encoders[0], now[1] - encoders[1]
+        walls = physics.wall_bearings() if bumped else ()
+        self.estimator.update(rolled_left * scale, rolled_right * scale, walls)
+
+        reward, success = self.collision_reward if bumped else 0.0, False
+        for zone, (centre_x, centre_y, square) in self._zones:
+            dx, dy = x - centre_x, y - centre_y
+            if dx * dx + dy * dy <= square:
+                reward += self._enter(zone)
+                success = success or zone == GOAL
+        if self.render_mode is not None:
+            self.trail.append((x, y))
+            if self.render_mode == "human":
+                self.render()
+        if self.on_simulator_step is not None:
+            self.on_simulator_step()
+        return reward, bumped, success
+
+    def _enter(self, zone: int) -> float:
+        """Return the reward inside a zone; correct the estimate at landmarks."""
+        if zone == GOAL:
+            return self.goal_reward
+        new = zone != START and not self.subgoals[zone]
+        if new or self.estimator.guarded:
+            self.estimator.fix(self.physics.pose())
+        if new:
+            self.subgoals[zone] = True
+        return self.subgoal_reward * new
+
+    def _observation(self, bumped: bool) -> np.ndarray:
+        pose = self.physics.pose() if self.pose_mode == "true" else self.estimator.pose
+        if not self.range_sensors:
+            return np.array(pose, dtype=np.float32)
+        return np.array([*pose, *self.physics.infrared_ranges(), bumped], dtype=np.float32)
+
+    def _info(self, steps: int, bumped: bool, success: bool) -> dict[str, Any]:
+        return {
+            "steps": steps,
+            "total_steps": self.total_steps,
+            "collision": bumped,
+            "success": success,
+            "subgoals": tuple(self.subgoals),
+            "true_pose": np.array(self.physics.pose()),
+            "estimated_pose": np.array(self.estimator.pose),
+        }
+
+    def _build_observation_space(self) -> gymnasium.spaces.Box:
+        # Without its guard an estimate may leave the arena, by at most what a trial can drive.
+        free = self.pose_mode != "true" and not self.estimator.guarded
+        reach = self.max_steps * STEP_SECONDS * FORWARD_SPEED * self.wheel_radius_scale * free
+        low = [-reach, -reach, -math.pi]
+        high = [self.plan.size[0] + reach, self.plan.size[1] + reach, math.pi]
+        if self.range_sensors:
+            low += [0.0] * 9
+            high += [INFRARED_RANGE] * 8 + [1.0]
+        return gymnasium.spaces.Box(np.float32(low), np.float32(high), dtype=np.float32)
+
+    def _start_pose(self, options: dict[str, Any]) -> Pose:
+        unknown = set(options) - {"pose"}
+        if unknown:
+            raise ValueError(f'unknown reset options {sorted(unknown)}: only "pose" is known')
+        pose = tuple(float(value) for value in options.get("pose", self.plan.start))
+        if len(pose) != 3 or not all(map(math.isfinite, pose)):
+            raise ValueError(f"the reset pose must be three finite numbers, not {pose}")
+        width, height = self.plan.size
+        inside = 0.0 < pose[0] < width and 0.0 < pose[1] < height
+        if not inside or self.plan.clearance(pose[0], pose[1]) < 0.0:
+            raise ValueError(f"the robot cannot be put at {pose[:2]}: a wall is there")
+        return pose
+
+
+def _check_choice(name: str, value: Any, choices: tuple[Any, ...]) -> None:
+    if value not in choices:
+        raise ValueError(f"{name} must be one of {choices}, not {value!r}")

@@ -1,0 +1,338 @@
+"""Self-organizing fuzzy neural network (section 2 of the paper, equations 1-4 and 10).
+
+One rule ``k`` owns one Gaussian membership function per input (centre ``u``, width ``v``) and a
+vector of consequents ``c``. For a state ``x``:
+
+    B_i^k(x_i) = exp(-((x_i - u_i^k) / v_i^k)^2 / 2)      membership        (eq. 1)
+    F^k(x)     = prod_i B_i^k(x_i)                        firing strength   (eq. 2)
+    S^k(x)     = F^k(x) / sum_l F^l(x)                    normalised firing
+    y_j(x)     = sum_k S^k(x) c_j^k                       output            (eqs 4 and 10)
+
+A rule is added where equation 3 says that none covers the state. The numbers of the rules, their
+traces and the steps of learning in them are in `sofnn_torch.network.table`.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from sofnn_torch.network import batches
+from sofnn_torch.network.table import RuleTable
+
+Growth = Literal["rule", "input", "literal", "frozen"]
+
+
+class SOFNN(RuleTable):
+    """Fuzzy network that adds a rule where no existing membership reaches ``theta``.
+
+    `RuleTable` describes what the rules hold. Letters in shapes: ``n`` inputs, ``m`` outputs, ``K``
+    rules, ``B`` states in a batch, ``F`` features of a state.
+
+    Args:
+        n_inputs: number of inputs ``n``.
+        n_outputs: number of consequents per rule ``m``.
+        width: width given to new membership functions, one for all inputs or one each.
+        theta: growth threshold ``theta_th`` of equation 3, in (0, 1).
+        growth: reading of equation 3. ``rule``: a rule is added when no rule's firing strength
+            reaches theta. ``input``: an input whose memberships all stay under theta gets a new
+            membership function, and each newly met combination of best membership functions
+            becomes a rule. ``literal``: a rule is added when no membership of any input
+            reaches theta. ``frozen``: the structure never changes (FSFNN).
+        periods: period of each input, 0 for an input that does not wrap (2 pi for an angle).
+        initial: consequents of a new rule, one for all or one each.
+        interpolate: give a new rule the network's present output instead of ``initial``, so that
+            the output at its centre does not change; one for all consequents or one each (the
+            first rule always gets ``initial``).
+        max_rules: no rule is added beyond this many; ``refused`` counts the attempts.
+        min_width: lower bound of adapted widths.
+        block_size: rules in the first block.
+        dtype: of the parameters.
+
+    Raises:
+        ValueError: a setting is out of range; the message says which and what to do.
+    """
+
+    def __init__(
+        self,
+        n_inputs: int,
+        n_outputs: int,
+        *,
+        width: float | Sequence[float],
+        theta: float = 0.4,
+        growth: Growth = "rule",
+        periods: Sequence[float] | None = None,
+        initial: float | Sequence[float] = 0.0,
+        interpolate: bool | Sequence[bool] = True,
+        max_rules: int = 100_000,
+        min_width: float = 1e-3,
+        block_size: int = 1024,
+        dtype: torch.dtype = torch.float32,
+    ):
+        super().__init__(
+            n_inputs,
+            n_outputs,
+            max_rules=max_rules,
+            min_width=min_width,
+            block_size=block_size,
+            shared=growth == "input",
+            dtype=dtype,
+        )
+        if not 0.0 < theta < 1.0:
+            raise ValueError(f"theta must lie between 0 and 1, got {theta}")
+        if growth not in ("rule", "input", "literal", "frozen"):
+            raise ValueError(f"growth must be rule, input, literal or frozen, got {growth!r}")
+        self.growth, self.theta, self.log_theta = growth, theta, math.log(theta)
+        self.max_firing = 0.0  # at the last state observed
+
+        def per(values, count: int, name: str) -> Tensor:
+            row = torch.as_tensor(values, dtype=dtype).flatten()
+            if len(row) not in (1, count) or not row.isfinite().all():
+                raise ValueError(f"{name} must be one finite number or {count} of them: {values}")
+            return row.expand(count).clone()
+
+        self.register_buffer("default_width", per(width, n_inputs, "width"), persistent=False)
+        self.register_buffer("initial", per(initial, n_outputs, "initial"), persistent=False)
+        mask = per(interpolate, n_outputs, "interpolate").bool()
+        self.register_buffer("interpolate", mask, persistent=False)
+        self.interpolates = bool(mask.any())
+        periods = per(0.0 if periods is None else periods, n_inputs, "periods")[:, None]
+        if not (self.default_width >= min_width).all():
+            raise ValueError(f"every width must be at least {min_width}, got {width}")
+        if (periods < 0).any():
+            raise ValueError("a period is positive, or 0 for an input that does not wrap")
+        self.register_buffer("periods", periods, persistent=False)  # (n, 1)
+        self.wrapping: batches.Wrapping = [
+            (i, (1 / period).item(), period.item())
+            for i, period in enumerate(periods)
+            if period > 0
+        ]
+
+    # ---------------------------------------------------------------- inference, eqs 1, 2, 4, 10
+
+    def log_memberships(self, x: Tensor) -> Tensor:
+        """Logarithm of equation 1 for x of shape (B, n). Shape: (B, n, K)."""
+        centres, widths, _ = self.table().split_with_sizes(self.parts)
+        return -0.5 * self._squares(x, centres, widths)
+
+    def firing_strengths(self, x: Tensor) -> Tensor:
+        """Firing strengths F of equation 2 for x of shape (B, n). Shape: (B, K)."""
+        return self.log_memberships(x).sum(-2).exp()
+
+    def normalised_firing(self, x: Tensor, antecedents: Sequence[Tensor] | None = None) -> Tensor:
+        """Normalised firing S for x of shape (B, n). Shape: (B, K).
+
+        Computed in log space, so that a state far from every rule is still answered by the
+        nearest ones where a product of memberships would underflow to 0 / 0.
+
+        Args:
+            x: states, or one state (n,) for one row (K,).
+            antecedents: centres and widths, each (n, K); those of the network if None.
+        """
+        centres, widths = antecedents or self.table().split_with_sizes(self.parts)[:2]
+        if x.dim() == 2 and len(x) >= batches.LARGE:
+            factors = batches.factors(centres, widths, self.wrapping)
+            features = batches.features(x.to(factors), self.wrapping)
+            return batches.log_firing(features, factors, self.wrapping).softmax(-1).to(x)
+        return (-0.5 * self._squares(x, centres, widths).sum(-2)).softmax(-1)
+
+    def firing_functions(self) -> tuple[Callable[[Tensor], Tensor], Callable[[Tensor], Tensor]]:
+        """The normalised firing in two steps, while the antecedents stay.
+
+        What depends on the antecedents alone is computed once, without a gradient.
+
+        Returns:
+            A function from states (.., n) to their features (.., F), and one from features to the
+            normalised firing (.., K).
+        """
+        factors = batches.factors(self._centres, self._widths, self.wrapping)
+
+        def features(x: Tensor) -> Tensor:
+            return batches.features(x.to(factors), self.wrapping)
+
+        def firing(features: Tensor) -> Tensor:
+            flat = features.reshape(-1, features.shape[-1])
+            log_firing = batches.log_firing(flat, factors, self.wrapping)
+            return log_firing.softmax(-1).to(self._centres).reshape(*features.shape[:-1], -1)
+
+        return features, firing
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Weighted mean of the consequents (eqs 4, 10) for x of shape (B, n). Shape: (B, m)."""
+        centres, widths, consequents = self.table().split_with_sizes(self.parts)
+        return self.normalised_firing(x, (centres, widths)) @ consequents.T
+
+    def conclude(self, firing: Tensor) -> Tensor:
+        """Outputs (m,) at a state whose normalised firing (K,) is known."""
+        return self._consequents @ firing
+
+    def _squares(self, x: Tensor, centres: Tensor, widths: Tensor) -> Tensor:
+        """((x - u) / v)^2 for x of shape (..., n). Shape: (..., n, K)."""
+        difference = x.unsqueeze(-1) - centres
+        tracked = difference.requires_grad or widths.requires_grad
+        for i, frequency, period in self.wrapping:  # whole turns have no gradient
+            angle = (difference.detach() if tracked else difference).select(-2, i)
+            angle.sub_((angle * frequency).round_(), alpha=period)
+        if tracked:
+            return (difference / widths).square()
+        return difference.div_(widths).square_()  # new memory costs as much as the arithmetic
+
+    # ------------------------------------------------------------------------- structure, eq. 3
+
+    def observe(self, x: Tensor) -> Tensor:
+        """Add at most one rule at the state x (n,) by equation 3; its normalised firing (K,).
+
+        The one pass over the rules that a learning step needs: growth test and firing share the
+        memberships. Counts the firing in ``usage``.
+
+        Raises:
+            ValueError: a frozen network has no rules.
+        """
+        if self.n_rules == 0 and not self.grow(x):
+            raise ValueError("the network has no rules and may add none: build it with grid()")
+        firing = self._grow(x).softmax(0)
+        self._usage.add_(firing)
+        return firing
+
+    def grow(self, x: Tensor) -> bool:
+        """Add at most one rule at the state x of shape (n,) by equation 3; True if one was."""
+        if self.n_rules == 0:
+            return self.growth != "frozen" and self.add_rule(x)
+        before = self.n_rules
+        self._grow(x)
+        return self.n_rules > before
+
+    def _grow(self, x: Tensor) -> Tensor:
+        """Apply equation 3; the logarithm of every rule's firing strength at x. Shape: (K,)."""
+        squares = self._squares(x, self._centres, self._widths)
+        log_firing = squares.sum(0).mul_(-0.5)
+        best = log_firing.max().item()
+        self.max_firing = math.exp(best)
+        if self.growth == "rule":
+            added = best < self.log_theta and self.add_rule(x, log_firing=log_firing)
+        elif self.growth == "literal":
+            nearest = -0.5 * squares.min().item()
+            added = nearest < self.log_theta and self.add_rule(x, log_firing=log_firing)
+        else:
+            added = self.growth == "input" and self._combine(x, squares.mul_(-0.5))
+        if not added:
+            return log_firing
+        if self.growth == "input":  # the new rule is centred on other rules' memberships
+            newest = self._squares(x, self._centres[:, -1:], self._widths[:, -1:])
+            return torch.cat([log_firing, newest.sum(0).mul_(-0.5)])
+        return torch.cat([log_firing, log_firing.new_zeros(1)])  # centred on x
+
+    def _combine(self, x: Tensor, log_memberships: Tensor) -> bool:
+        """Criterion ``input``: labels say which rules share a membership function."""
+        best, rule = log_memberships.max(1)
+        inputs = torch.arange(self.n_inputs, device=x.device)
+        is_new = best < self.log_theta
+        labels = torch.where(is_new, self.labels.amax(1) + 1, self.labels[inputs, rule])
+        if (self.labels == labels[:, None]).all(0).any():
+            return False
+        centre = torch.where(is_new, x, self._centres[inputs, rule])
+        width = torch.where(is_new, self.default_width, self._widths[inputs, rule])
+        return self.add_rule(centre, width, labels=labels)
+
+    def add_rule(
+        self,
+        centre: Tensor,
+        width: Tensor | None = None,
+        consequents: Tensor | None = None,
+        labels: Tensor | None = None,
+        log_firing: Tensor | None = None,
+    ) -> bool:
+        """Append one rule with its traces and counters; False at the cap ``max_rules``.
+
+        Args:
+            centre: centres of its membership functions. Shape: (n,).
+            width: their widths; the configured ones if None. Shape: (n,).
+            consequents: the configured or interpolated ones if None. Shape: (m,).
+            labels: which shared membership function each input uses; a new one each if None.
+                Shape: (n,).
+            log_firing: logarithm of the firing strengths at the centre, if known. Shape: (K,).
+
+        Raises:
+            ValueError: a value is not finite or a width is not positive.
+        """
+        k = self.n_rules
+        if k >= self.max_rules:
+            self.refused += 1
+            return False
+        width = self.default_width if width is None else width
+        if consequents is None:
+            consequents = self._first_consequents(centre, log_firing)
+        self._append(torch.cat([centre, width, consequents]), labels)
+        return True
+
+    def _first_consequents(self, centre: Tensor, log_firing: Tensor | None) -> Tensor:
+        """The configured consequents, or where so configured the present output. Shape: (m,)."""
+        if self.n_rules == 0 or not self.interpolates:
+            return self.initial
+        if log_firing is None:
+            firing = self.normalised_firing(centre, (self._centres, self._widths))
+        else:
+            firing = log_firing.softmax(0)
+        return torch.where(self.interpolate, self.conclude(firing), self.initial)
+
+    def replace_rules(self, centres: Tensor, widths: Tensor, consequents: Tensor) -> None:
+        """Put these rules in the place of all: see `RuleTable.replace_rules`.
+
+        Raises:
+            ValueError: also if a frozen structure would get another number of rules.
+        """
+        if self.growth == "frozen" and self.n_rules not in (0, len(centres)):
+            raise ValueError(
+                f"a frozen structure keeps its {self.n_rules} rules, got {len(centres)}"
+            )
+        super().replace_rules(centres, widths, consequents)
+
+    def statistics(self, max_firing: Sequence[float]) -> dict[str, float]:
+        """Growth and use of the rules since the last call (docs/metrics.md).
+
+        Args:
+            max_firing: firing strength of the best rule at each state since then.
+        """
+        used = (self.usage > 0.01).float().mean().item()
+        self.usage.zero_()
+        return {
+            "rules/max_firing_mean": sum(max_firing) / len(max_firing),
+            "rules/max_firing_min": min(max_firing),
+            "rules/share_used": used,
+            "rules/refused": float(self.refused),
+        }
+
+
+def grid(
+    lows: Sequence[float], highs: Sequence[float], shape: Sequence[int], n_outputs: int, **settings
+) -> SOFNN:
+    """Fixed-structure twin (FSFNN): a regular grid of rules whose structure is frozen.
+
+    Args:
+        lows: lower end of each input; a periodic input needs highs - lows = its period.
+        highs: upper end of each input.
+        shape: rules along each input, e.g. (12, 12, 8) for the paper's 1152.
+        n_outputs: consequents per rule.
+        **settings: keyword arguments of `SOFNN`; the default width is half the grid's spacing.
+
+    Raises:
+        ValueError: lengths differ, a range is empty or a count is not positive.
+    """
+    if not len(lows) == len(highs) == len(shape):
+        raise ValueError(f"lows, highs and shape differ in length: {lows}, {highs}, {shape}")
+    if any(s < 1 for s in shape) or any(h <= lo for lo, h in zip(lows, highs, strict=True)):
+        raise ValueError(f"a grid needs positive counts and non-empty ranges: {shape}")
+    spacing = [(h - lo) / s for lo, h, s in zip(lows, highs, shape, strict=True)]
+    settings = {"width": [s / 2 for s in spacing], **settings, "growth": "frozen"}
+    count = torch.Size(shape).numel()
+    net = SOFNN(len(shape), n_outputs, block_size=count, max_rules=count, **settings)
+    axes = [
+        lo + step * (torch.arange(s, dtype=torch.float64) + 0.5)
+        for lo, step, s in zip(lows, spacing, shape, strict=True)
+    ]
+    centres = torch.cartesian_prod(*axes).reshape(count, len(shape))
+    per_rule = [row.expand(count, -1) for row in (net.default_width, net.initial)]
+    net.replace_rules(centres, *per_rule)
+    return net

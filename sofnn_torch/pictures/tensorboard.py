@@ -1,0 +1,192 @@
+"""TensorBoard: scalars, settings, pictures and now and then a video of a training run.
+
+Names and formulas of the metrics are in docs/metrics.md; the horizontal axis is the trial.
+Nothing here touches the learner's random numbers or the training environment, and nothing here
+stops a training: what cannot be written or drawn is said once and left out.
+"""
+
+import dataclasses
+import gc
+import io
+from collections import deque
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+from tensorboard.compat.proto.summary_pb2 import Summary
+from torch.utils.tensorboard.summary import hparams
+
+from sofnn_torch.learners.survey import usage
+from sofnn_torch.pictures import figures
+from sofnn_torch.pictures.events import EventFile
+from sofnn_torch.pictures.film import film, gif
+from sofnn_torch.runs.directory import flatten
+from sofnn_torch.runs.factory import Agent, make_env
+from sofnn_torch.runs.settings import Config
+from sofnn_torch.runs.trial import Trajectory, TrialRecord
+from sofnn_torch.terminal import say
+
+WINDOW = 10  # trials in the moving success rate
+VIDEO_STEPS = 1000  # a robot that does not find the goal is not filmed for ever
+HPARAM_METRICS = ("trial/steps", "trial/success_last_10", "trial/return", "rules/count")
+
+
+class Monitor:
+    """Writes a run's progress for TensorBoard into its directory.
+
+    Args:
+        run_dir: directory of the run.
+        config: settings of the run, shown under HPARAMS.
+        first_trial: the trial that comes next; what an interrupted run wrote from there on is
+            hidden, and successes before it are read from ``trials.csv``.
+        picture_every: trials between two sets of pictures, 0 for none.
+        video_every: trials between two videos, 0 for none.
+    """
+
+    def __init__(
+        self,
+        run_dir: Path,
+        config: Config,
+        first_trial: int = 1,
+        picture_every: int = 25,
+        video_every: int = 50,
+    ):
+        self.run_dir, self.config = Path(run_dir), config
+        self.picture_every, self.video_every = picture_every, video_every
+        self.successes: deque[float] = deque(self._earlier_successes(first_trial), maxlen=WINDOW)
+        self._plan = None
+        self._broken: set[str] = set()
+        self._warned = False
+        self._events: EventFile | None = None
+        self._guard("TensorBoard", lambda: self._open(first_trial))
+
+    def trial(
+        self, record: TrialRecord, path: Trajectory, agent: Agent, steps_per_second: float
+    ) -> None:
+        """Write the scalars of a trial and, when their turn has come, pictures and a video.
+
+        Args:
+            record: the trial.
+            path: where the robot went in it.
+            agent: the learner after the trial.
+            steps_per_second: simulator steps over wall-clock time of the trial.
+        """
+        self.successes.append(record.success)
+        self._guard("TensorBoard", lambda: self._scalars(record, steps_per_second))
+        if self._due(record.trial, self.picture_every):
+            self._guard("pictures", lambda: self._pictures(record.trial, path, agent))
+        if self._due(record.trial, self.video_every):
+            self._guard("video", lambda: self._video(record.trial, agent))
+
+    def flush(self) -> None:
+        """Hand what was written to the operating system."""
+        if self._events is not None:
+            self._guard("TensorBoard", self._events.flush)
+
+    def close(self) -> None:
+        """Write what is still in memory and give the file back."""
+        if self._events is not None:
+            self._guard("TensorBoard", self._events.close)
+            self._events = None
+
+    def _guard(self, part: str, action: Callable[[], None]) -> None:
+        """Run an action; say a failure once and go on without, or try again if it is the disk."""
+        if part in self._broken:
+            return
+        try:
+            action()
+        except OSError as error:
+            self._events = None
+            if not self._warned:
+                self._warned = True
+                say(
+                    f"warning: no TensorBoard in {self.run_dir} for now, training goes on "
+                    f"({error.strerror or error})"
+                )
+        except Exception as error:  # GL and drawing fail in many ways; none may end a run
+            self._broken.add(part)
+            reason = " ".join(str(error).split()) or type(error).__name__
+            say(f"warning: no {part} from now on, training goes on ({reason})")
+
+    def _open(self, trial: int) -> None:
+        self._events = EventFile(self.run_dir, trial)
+        self._hparams()
+
+    def _hparams(self) -> None:
+        """Write the settings into this run; torch's `add_hparams` would make a second."""
+        settings = flatten(dataclasses.asdict(self.config))
+        plain = {
+            name: value if isinstance(value, bool | int | float | str) else str(value)
+            for name, value in settings.items()
+        }
+        for summary in hparams(plain, dict.fromkeys(HPARAM_METRICS)):
+            self._events.add(summary)
+
+    def _scalars(self, record: TrialRecord, steps_per_second: float) -> None:
+        if self._events is None or not self._events.path.exists():  # the disk failed, or deleted
+            self._open(record.trial)
+        values = {
+            "trial/steps": record.steps,
+            "trial/decisions": record.decisions,
+            "trial/return": record.reward,
+            "trial/success": float(record.success),
+            "trial/success_last_10": sum(self.successes) / len(self.successes),
+            "trial/collisions": record.collisions,
+            "trial/subgoals": record.subgoals,
+            "trial/total_steps": record.total_steps,
+            "rules/count": record.rules,
+            "pose/error_mean": record.pose_error,
+            "pose/error_max": record.pose_error_max,
+            "pose/heading_error_mean": record.heading_error,
+            "speed/steps_per_second": steps_per_second,
+        }
+        scalars = [
+            Summary.Value(tag=k, simple_value=v) for k, v in (values | record.statistics).items()
+        ]
+        self._events.add(Summary(value=scalars), record.trial)
+        self._events.flush()
+
+    def _pictures(self, trial: int, path: Trajectory, agent: Agent) -> None:
+        if self._plan is None:
+            env = make_env(self.config)
+            self._plan = env.unwrapped.plan
+            env.close()
+        plan, states = self._plan, path.decided_at(self.config.pose)
+        drawings = {
+            "trajectory": lambda ax: figures.trajectory(plan, path, ax),
+            "rules": lambda ax: figures.rule_map(plan, agent, ax, usage(agent, states)),
+            "policy": lambda ax: figures.action_field(plan, agent, ax),
+            "pose_error": lambda ax: figures.pose_error(path, ax, plan),
+        }
+        if getattr(agent, "learned", True):  # an SGA with a constant baseline knows no values
+            drawings["value"] = lambda ax: figures.value_field(plan, agent, ax)
+        for name, draw in drawings.items():
+            figure, (ax,) = figures.canvas(width=5, height=5, tight=False)
+            draw(ax)
+            self._image(f"pictures/{name}", figures.png(figure, dpi=100), trial)
+        gc.collect()  # figures refer to themselves: 200 MiB would wait for the next full collection
+
+    def _video(self, trial: int, agent: Agent) -> None:
+        frames = film(self.config, agent, steps_per_frame=10, limit=VIDEO_STEPS, size=240)
+        self._image("video/evaluation", gif(frames), trial)
+
+    def _image(self, name: str, data: bytes, trial: int) -> None:
+        width, height = Image.open(io.BytesIO(data)).size
+        image = Summary.Image(width=width, height=height, colorspace=3, encoded_image_string=data)
+        summary = Summary(value=[Summary.Value(tag=name, image=image)])
+        if self._events is not None:
+            self._events.add(summary, trial)
+
+    @staticmethod
+    def _due(trial: int, every: int) -> bool:
+        return every > 0 and trial % every == 0
+
+    def _earlier_successes(self, first_trial: int) -> NDArray[np.float64]:
+        with suppress(OSError, ValueError):
+            if first_trial > 1:
+                column = figures.read_column(self.run_dir / "trials.csv", "success")
+                return column[max(0, first_trial - 1 - WINDOW) : first_trial - 1]
+        return np.array([])

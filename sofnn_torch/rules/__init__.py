@@ -1,0 +1,1 @@
+"""Rules that people read and edit: words, files, and the command."""

@@ -1,0 +1,51 @@
+"""What may cut a run short: a signal, and numbers that diverge."""
+
+import math
+
+import mujoco
+import numpy as np
+
+from sofnn_torch.runs.factory import Agent
+
+FARTHEST = 100.0  # metres, radians: no rule out there ever fires
+WIDEST = 50.0  # times the width of a new rule: it fires everywhere and no more rules are added
+LARGEST = 1e9  # no reward and no step size that make sense lead to a consequent beyond this
+WARNINGS = ("BADQPOS", "BADQVEL", "BADQACC", "BADCTRL", "CONTACTFULL", "CNSTRFULL", "INERTIA")
+
+
+class Divergence(ArithmeticError):
+    """Numbers stopped being finite or sensible; the message says which."""
+
+
+def diagnose(agent: Agent, observation: np.ndarray) -> str:
+    """What is not finite, or beyond all sense, in a learner or its input; empty if nothing is."""
+    if not np.isfinite(observation).all():
+        return f"the observation is {observation.tolist()}"
+    net = agent.net
+    if net.n_rules == 0:
+        return ""
+    parts = {
+        "centres": (net.centres, FARTHEST),
+        "widths": (net.widths, WIDEST * net.default_width),
+        "consequents": (net.consequents, LARGEST),
+        "eligibility traces": (net.traces.T, math.inf),
+    }
+    for name, (values, limit) in parts.items():
+        bad = ~(values.abs() < limit).all(1)  # a NaN is not smaller than anything
+        if bad.any():
+            rule = int(bad.nonzero()[0])
+            worst = ", ".join(f"{value:.3g}" for value in values[rule].tolist())
+            count = f"{int(bad.sum())} of {net.n_rules} rules"
+            return f"{name} of {count}, as in rule {rule + 1}: {worst}"
+    return ""
+
+
+def physics_warnings(env) -> str:
+    """MuJoCo's warnings since the last reset that make a simulation worthless; empty if none."""
+    physics = getattr(env.unwrapped, "physics", None)
+    if physics is None:
+        return ""
+    counts = physics.data.warning.number
+    kinds = {name: getattr(mujoco.mjtWarning, f"mjWARN_{name}").value for name in WARNINGS}
+    found = [f"{name} x {counts[kind]}" for name, kind in kinds.items() if counts[kind]]
+    return f"MuJoCo warns of {', '.join(found)}" if found else ""

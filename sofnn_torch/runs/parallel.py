@@ -1,0 +1,133 @@
+"""Several seeds in one call: one process and one run directory for each.
+
+joblib hands out the seeds; each is trained by a process of its own, so that one which crashes or
+is killed takes no other with it.
+"""
+
+import contextlib
+import dataclasses
+import os
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from joblib import Parallel, delayed
+from tqdm import tqdm
+
+from sofnn_torch.runs import directory
+from sofnn_torch.runs.settings import Config
+from sofnn_torch.runs.signals import Interrupted, SignalTrap
+from sofnn_torch.terminal import say
+from sofnn_torch.training import RunOptions
+
+OWN = {"--seeds", "--workers", "--name", "--seed"}  # flags that the single runs do not inherit
+MOST = 10_000  # seeds in one call
+HOME = str(Path(__file__).parents[2])  # the children must find this package, installed or not
+PATHS = [HOME, *filter(None, [os.environ.get("PYTHONPATH")])]
+ENVIRONMENT = os.environ | {"PYTHONPATH": os.pathsep.join(PATHS)}
+
+
+def train(
+    config: Config, options: RunOptions, listed: str, workers: int, argv: Sequence[str]
+) -> int:
+    """Train the seeds, `workers` at a time, under one progress bar; the exit code.
+
+    Raises:
+        ValueError: the list of seeds cannot be read.
+        Interrupted: after every run was saved.
+    """
+    numbers = parse(listed)
+    common = [sys.executable, "-m", "sofnn_torch.cli", *_without(argv, OWN), "--quiet"]
+    jobs = []
+    for number in numbers:
+        name = options.name and f"{options.name}-s{number}"
+        name = name or directory.default_name(dataclasses.replace(config, seed=number))
+        path = directory.first_free(options.runs / name)
+        jobs.append((number, path, [*common, "--seed", str(number), "--name", path.name]))
+    failed = 0
+    with (
+        SignalTrap() as trap,
+        tqdm(
+            total=config.trials * len(jobs),
+            unit="trial",
+            desc=f"{len(jobs)} seeds",
+            disable=options.quiet,
+        ) as bar,
+    ):
+        parallel = Parallel(n_jobs=workers, backend="threading", return_as="generator_unordered")
+        for number, path, code, message in parallel(
+            delayed(watch)(*job, bar, trap) for job in jobs
+        ):
+            failed += code != 0
+            if code == 0:
+                tqdm.write(f"{path}: done")
+            else:
+                say(f"seed {number}: {message}, {path}")
+    if trap.number:
+        raise Interrupted(trap.number)
+    if failed:
+        say(f"{failed} of {len(jobs)} seeds failed")
+    return 1 if failed else 0
+
+
+def parse(listed: str) -> list[int]:
+    """The seeds in a list such as ``0-3,7``.
+
+    Raises:
+        ValueError: it is no such list.
+    """
+    numbers: list[int] = []
+    with contextlib.suppress(ValueError):
+        for part in listed.split(","):
+            low, dash, high = part.partition("-")
+            numbers += range(int(low), int(high if dash else low) + 1)[:MOST]
+        if numbers and len(set(numbers)) == len(numbers) < MOST:
+            return numbers
+    raise ValueError(f"--seeds must be a list such as 0-7 or 0,3,5, got {listed!r}")
+
+
+def watch(
+    number: int, path: Path, command: list[str], bar: tqdm, trap: SignalTrap
+) -> tuple[int, Path, int, str]:
+    """Run the command of a training to its end; its number, directory, exit code and message."""
+    if trap.number:
+        return number, path, 128 + trap.number, "not started"
+    child = subprocess.Popen(
+        command, env=ENVIRONMENT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+    )
+    shown, told = 0, False
+    while True:
+        try:
+            _, errors = child.communicate(timeout=0.5)
+        except subprocess.TimeoutExpired:
+            errors = None
+        done = _trials(path)
+        bar.update(done - shown)
+        shown = done
+        if errors is not None:
+            lines = errors.strip().splitlines()
+            message = lines[-1] if lines and child.returncode >= 0 else "killed"
+            return number, path, child.returncode, f"exit code {child.returncode} ({message})"
+        if trap.number and not told:  # once: a second one could hit a child that has just saved
+            child.send_signal(trap.number)
+            told = True
+
+
+def _trials(path: Path) -> int:
+    with contextlib.suppress(OSError):
+        return max(0, (path / "trials.csv").read_bytes().count(b"\n") - 1)
+    return 0
+
+
+def _without(argv: Sequence[str], flags: set[str]) -> list[str]:
+    """The arguments without some flags and their values."""
+    kept, skip = [], False
+    for word in argv:
+        if skip:
+            skip = False
+        elif word in flags:
+            skip = True
+        elif word.partition("=")[0] not in flags:
+            kept.append(word)
+    return kept

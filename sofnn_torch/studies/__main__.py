@@ -1,0 +1,128 @@
+"""Run the paper's section 5 and the studies around it; write data, tables and figures.
+
+    python -m sofnn_torch.studies                               # section 5, 10 seeds: hours
+    python -m sofnn_torch.studies --quick                       # the same in minutes, to look at
+    python -m sofnn_torch.studies --study growth ablation --seeds 0-4 --workers 8
+    python -m sofnn_torch.studies --report-only                 # tables and figures from the data
+
+Every run is a normal run directory below --runs and is found again by its settings: finished runs
+are kept, a killed one goes on where it was, and studies share the runs that they have in common.
+"""
+
+import dataclasses
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from sofnn_torch.maze.optimum import optimal_steps
+from sofnn_torch.maze.robot import Physics
+from sofnn_torch.runs import parallel
+from sofnn_torch.runs.signals import Interrupted
+from sofnn_torch.studies import collecting, report, running
+from sofnn_torch.terminal import output, parse, say
+
+
+@dataclass(frozen=True)
+class Options:
+    """Run studies, or only write their tables and figures anew."""
+
+    study: tuple[Literal["section5", "paper", "growth", "ablation", "fixed", "robustness"], ...] = (
+        "section5",
+    )
+    """Studies to run; all of them: section5 paper growth ablation fixed robustness."""
+    arms: str = ""
+    """Only the arms whose name contains this text, e.g. `sofnn` or `q-no`."""
+    seeds: str | None = None
+    """Seeds of every arm, such as `0-9` (the default) or `0,3,5`."""
+    workers: int = 2
+    """Runs at the same time, each in a process of its own on one core."""
+    trials: int | None = None
+    """Trials of every run; by default those of the presets."""
+    max_steps: int | None = None
+    """Steps after which a trial ends; by default those of the presets."""
+    out: Path | None = None
+    """Where data, tables and figures go; by default docs/results."""
+    runs: Path | None = None
+    """Where the runs are; by default runs/studies."""
+    quick: bool = False
+    """Few short runs, to see everything work: 2 seeds, 30 trials of at most 3000 steps, all of it
+    below runs/quick. The numbers mean nothing."""
+    report_only: bool = False
+    """Run nothing: tables and figures from the data that is there."""
+
+    def __post_init__(self) -> None:
+        """Check the numbers; ValueError names the flag."""
+        for name in ("workers", "trials", "max_steps"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise ValueError(f"--{name.replace('_', '-')} must be at least 1, got {value}")
+
+
+def complete(options: Options) -> Options:
+    """The options with everything that was left open."""
+    usual = {"seeds": "0-9", "out": Path("docs/results"), "runs": Path("runs/studies")}
+    if options.quick:
+        home = Path("runs/quick")
+        usual = {"seeds": "0-1", "out": home / "results", "runs": home}
+        usual |= {"trials": 30, "max_steps": 3000}
+    unset = {name: value for name, value in usual.items() if getattr(options, name) is None}
+    return dataclasses.replace(options, **unset)
+
+
+def variations(options: Options) -> dict[str, int]:
+    """The settings that the options change in every arm."""
+    asked = {"trials": options.trials, "maze.max_steps": options.max_steps}
+    return {name: value for name, value in asked.items() if value is not None}
+
+
+def command(name: str, options: Options) -> str:
+    """The command that makes a study."""
+    usual = complete(Options(quick=options.quick))
+    words = [f"python -m sofnn_torch.studies --study {name}", *["--quick"] * options.quick]
+    words += [
+        f"--{flag.replace('_', '-')} {getattr(options, flag)}"
+        for flag in ("arms", "seeds", "trials", "max_steps")
+        if getattr(options, flag) != getattr(usual, flag)
+    ]
+    return " ".join(words)
+
+
+def run(options: Options) -> int:
+    """What the command does; the exit code.
+
+    Raises:
+        ValueError: options that fit nothing.
+        Interrupted: by a signal, after saving.
+    """
+    options = complete(options)
+    if options.report_only:
+        return report.write(options.out)
+    numbers, changes = parallel.parse(options.seeds), variations(options)
+    jobs = running.plan(options.runs, options.study, options.arms, numbers, changes)
+    if not jobs:
+        raise ValueError(f"--arms {options.arms}: no arm of {', '.join(options.study)} has that")
+    failed = running.execute(jobs, options.workers)
+    optimum = optimal_steps(Physics().plan).steps
+    for name in options.study:
+        notes = {"command": command(name, options), "quick": options.quick, "optimum": optimum}
+        collecting.collect(name, options.runs, options.out, changes, notes)
+    report.write(options.out)
+    return 1 if failed else 0
+
+
+def main() -> None:
+    """Entry point of ``python -m sofnn_torch.studies``."""
+    try:
+        with output():
+            sys.exit(run(parse(Options, sys.argv[1:], __doc__)))
+    except (ValueError, OSError) as error:
+        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
+        sys.exit(2)
+    except Interrupted as stop:
+        say("stopped and saved; the same command goes on")
+        sys.exit(128 + stop.number)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,200 @@
+"""Pages in Markdown, with figures, from the data of the studies: nothing here needs the runs."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sofnn_torch.studies import drawing
+from sofnn_torch.studies.claims import HOW, SWAPPED, arriving, claims, closing_table, goals
+from sofnn_torch.studies.drawing import AGENTS
+from sofnn_torch.studies.results import (
+    Data,
+    cell,
+    learned_after,
+    markdown,
+    mean,
+    median,
+    ratio,
+    read,
+)
+from sofnn_torch.studies.studies import STUDIES
+from sofnn_torch.terminal import say
+
+NOTES = """\
+Cells are medians over the seeds, with the 95 % interval of a percentile bootstrap over seeds in
+brackets; success is the mean over the seeds. *Arriving* is the number of seeds for which at least
+9 of the last 10 training trials ended at the goal. *Trials to learn* is the trial that completes
+the first {in_a_row} in a row under {within} times the optimum (in training, so exploration
+included); a run where that never happens counts as more than its number of trials. What was
+learned is then played for {episodes} trials without learning: *greedy* is the mean action (SGA) or
+the best one (Q), *sampled* the stochastic policy of the training; both gain chance at a rule after
+the robot's fourth decision there in a trial, so that they leave
+[circles](../paper.md#what-plays-in-an-evaluation-and-loops). A trial that fails counts with its
+{limit:,} steps. The kinematic optimum of the maze, with actions held 10 steps, is {optimum} steps
+(`python -m sofnn_torch.maze.optimum`)."""
+DIVERGED = """\
+A seed *diverged* if its numbers left all bounds, where the training stops. It counts as one that
+never reaches the goal, with the rules of its last whole trial; an arm of nothing else shows `-`."""
+CONDITION_NOTES = """\
+Greedy policy, 10 trials for each seed; mean success and median steps over the seeds, with 95 %
+intervals. The robot is told the pose that it starts from, scattered or not, as at every pass of
+the start. The sampled policy is in the data."""
+
+
+def arm_table(data: Data, arms: Sequence[str]) -> str:
+    """The main table of a study, for some of its arms."""
+    changes = any(data.info["arms"][arm]["changes"] for arm in arms)
+    base = next((arm for arm in arms if arm.endswith("-default")), None)
+    head = [
+        "arm",
+        *["change"] * changes,
+        "seeds",
+        "arriving",
+        "trials to learn",
+        "success, greedy [%]",
+    ]
+    head += ["steps, greedy", "over the optimum", *["over the default"] * bool(base)]
+    head += ["success, sampled [%]", "steps, sampled", "collisions a trial", "rules"]
+    rows = []
+    for arm in arms:
+        flags = data.info["arms"][arm]["changes"]
+        greedy = data.column(arm, "greedy_steps")
+        row = [arm, *[f"`{flags}`" if flags else ""] * changes, str(len(greedy))]
+        row.append(data.remark(str(arriving(data, arm)[0]), arm))
+        if data.diverged(arm) == len(greedy):
+            rows.append(row + ["-"] * (len(head) - len(row)))
+            continue
+        row += [
+            cell(learned_after(data, arm), limit=data.column(arm, "trials")[0]),
+            cell(mean(data.column(arm, "greedy_success")), 1, 100),
+            cell(median(greedy)),
+            cell(median(greedy), 2, 1 / data.info["optimum"]),
+        ]
+        if base:
+            compared = ratio(greedy, data.column(base, "greedy_steps"))
+            row.append(cell(compared, 2) if arm != base else "1")
+        row += [
+            cell(mean(data.column(arm, "sampled_success")), 1, 100),
+            cell(median(data.column(arm, "sampled_steps"))),
+            cell(median(data.column(arm, "sampled_collisions")), 1),
+            cell(median(data.column(arm, "rules"))),
+        ]
+        rows.append(row)
+    return markdown(head, rows, 1 + changes)
+
+
+def arm_tables(data: Data) -> str:
+    """A table for each learner where arms vary the settings of one, else one for all."""
+    arms = data.arms()
+    if not any(arm.endswith("-default") for arm in arms):
+        return arm_table(data, arms)
+    own = {title: [a for a in arms if a.startswith(f"{k}-")] for k, title in AGENTS.items()}
+    parts = [f"### {title}\n\n{arm_table(data, names)}" for title, names in own.items() if names]
+    return "\n\n".join(parts)
+
+
+def provenance(info: dict[str, Any]) -> str:
+    """With what a study was made, and how long it took."""
+    commits = ", ".join(f"`{commit}`" for commit in info["commits"])
+    versions = "; ".join(
+        ", ".join(f"{name} {version}" for name, version in made.items())
+        for made in info["versions"]
+    )
+    hours = info["wall_seconds"] / 3600, info["cpu_seconds"] / 3600
+    return (
+        f"Made with {_commands(info)}; number of runs: {info['runs']}, together {hours[0]:.2f} "
+        f"hours of wall time and {hours[1]:.2f} of processor time. Commit: {commits}. "
+        f"Versions: {versions}. Settings and seeds of every arm: "
+        f"[{info['study']}.json]({info['study']}.json); a line for each run: "
+        f"[{info['study']}.csv]({info['study']}.csv)."
+    )
+
+
+def _commands(info: dict[str, Any]) -> str:
+    return ", ".join(f"`{command}`" for command in info["made_with"])
+
+
+def page(out: Path, data: Data) -> str:
+    """The page of a study; its figures are drawn into the directory."""
+    info, study = data.info, STUDIES[data.info["study"]]
+    limit = max(arm["config"]["maze"]["max_steps"] for arm in info["arms"].values())
+    trials = sorted({arm["config"]["trials"] for arm in info["arms"].values()})
+    length = f"Runs of {' or '.join(map(str, trials))} trials."
+    parts = [f"# {info['title']}", f"{study.about} {length}"]
+    if info["quick"]:
+        parts.append("**A quick look with short runs: the numbers mean nothing.**")
+    if study.figures:
+        parts += ["## Beside the paper's numbers"]
+        parts += [markdown(["", "paper", "here", "over the optimum"], closing_table(data)), SWAPPED]
+        parts += ["## The paper's claims"]
+        parts += [markdown(["claim", "criterion", "measured", "verdict"], claims(data), 4), HOW]
+        if (out / "fixed.csv").exists():
+            parts += ["What else was tried for FSFNN: [the search over its settings](fixed.md)."]
+        parts += ["## What was to be reached (greedy policy)"]
+        parts += [markdown(["learner", "goal", "measured", "reached"], goals(data), 4)]
+    if study.conditions and "conditions" in data.tables:
+        parts += ["## In other conditions", condition_table(data), CONDITION_NOTES]
+    captions = drawing.draw(out, data)
+    if captions:
+        parts += [
+            "## Figures",
+            *(f"![{text.partition(':')[0]}]({name}.png)\n\n*{text}*" for name, text in captions),
+        ]
+    parts += ["## All arms", arm_tables(data), NOTES.format(limit=limit, **info)]
+    parts += [DIVERGED] * bool(data.diverged(*info["arms"]))
+    return "\n\n".join(part.strip() for part in [*parts, "## Provenance", provenance(info)]) + "\n"
+
+
+def condition_table(data: Data) -> str:
+    """Success and steps of every arm in every condition."""
+    rows = data.tables["conditions"]
+    conditions = list(dict.fromkeys((row["group"], row["value"]) for row in rows))
+    arms = data.arms()
+    head = [
+        "condition",
+        *(f"{arm}, {quantity}" for arm in arms for quantity in ("success", "steps")),
+    ]
+    lines = []
+    for group, value in conditions:
+        line = [group.replace("[", f"{value:g} [")]
+        for arm in arms:
+            chosen = [
+                row
+                for row in rows
+                if (row["arm"], row["group"], row["value"]) == (arm, group, value)
+                and row["policy"] == "greedy"
+            ]
+            success, steps = (np.array([row[q] for row in chosen]) for q in ("success", "steps"))
+            line += [f"{cell(mean(success), 0, 100)} %", cell(median(steps))]
+        lines.append(line)
+    return markdown(head, lines)
+
+
+def write(out: Path) -> int:
+    """Write the page of every study that has data in a directory, and the index; the exit code.
+
+    Raises:
+        ValueError: there is no data.
+    """
+    names = [name for name in STUDIES if (out / f"{name}.csv").exists()]
+    if not names:
+        raise ValueError(f"{out}: no data of a study; run one first")
+    index = []
+    for name in names:
+        data = read(out, name)
+        (out / f"{name}.md").write_text(page(out, data))
+        seeds = sorted({len(arm["seeds"]) for arm in data.info["arms"].values()})
+        count = "-".join(map(str, seeds[:: max(1, len(seeds) - 1)]))
+        link = f"[{data.info['title']}]({name}.md)"
+        index.append([link, str(len(data.info["arms"])), count, _commands(data.info)])
+    text = (
+        "# Results\n\nEvery table and figure here is written by a command, from the data beside "
+        "it. `python -m sofnn_torch.studies --report-only` writes them anew without running "
+        "anything.\n\n"
+    )
+    text += markdown(["study", "arms", "seeds of an arm", "command"], index, 4)
+    (out / "README.md").write_text(text + "\n")
+    say(f"written: {out}/README.md and the pages of {', '.join(names)}")
+    return 0

@@ -1,0 +1,198 @@
+"""Runs of the studies: found again by their settings, each done in a process of its own."""
+
+import contextlib
+import dataclasses
+import itertools
+import json
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from joblib import Parallel, delayed
+from tqdm import tqdm
+
+from sofnn_torch import evaluate, training
+from sofnn_torch.pictures.figures import read_column
+from sofnn_torch.runs import checkpoint, directory, session
+from sofnn_torch.runs.guard import Divergence
+from sofnn_torch.runs.parallel import watch
+from sofnn_torch.runs.session import arithmetic
+from sofnn_torch.runs.settings import Config, from_dict
+from sofnn_torch.runs.signals import Interrupted, SignalTrap
+from sofnn_torch.runs.trial import Trajectory, TrialRecord
+from sofnn_torch.studies.robustness import under_conditions
+from sofnn_torch.studies.studies import STUDIES, essence, settings
+from sofnn_torch.terminal import say
+
+EPISODES = 10  # evaluation trials of a run, for each policy
+WORK = "import sys; from sofnn_torch.studies.running import work; sys.exit(work(*sys.argv[1:]))"
+
+
+@dataclass(frozen=True)
+class Job:
+    """One run: its directory, its settings, and whether it is also played in other conditions."""
+
+    path: Path
+    config: Config
+    conditions: bool
+
+    def done(self) -> bool:
+        """All its files are there."""
+        names = ["evaluation.json", "conditions.json"][: 1 + self.conditions]
+        return all((self.path / name).exists() for name in names)
+
+
+def find_runs(parent: Path) -> dict[Config, Path]:
+    """The runs in a directory by what determines them; of equal ones the finished."""
+    found: dict[Config, Path] = {}
+    for file in sorted(parent.glob("*/config.json")):
+        with contextlib.suppress(ValueError):  # written by a version with other settings
+            key = essence(directory.load_config(file.parent))
+            if key not in found or not (found[key] / "evaluation.json").exists():
+                found[key] = file.parent
+    return found
+
+
+def plan(
+    parent: Path,
+    studies: Sequence[str],
+    only: str,
+    numbers: Sequence[int],
+    changes: Mapping[str, Any],
+) -> list[Job]:
+    """The runs that studies need, each once.
+
+    Args:
+        parent: where runs are and will be.
+        studies: names of the studies.
+        only: text that is in the name of every arm to run.
+        numbers: seeds.
+        changes: settings that are changed in every arm.
+    """
+    existing, jobs = find_runs(parent), {}
+    for name in studies:
+        study, taken = STUDIES[name], {job.path for job in jobs.values()}
+        for seed, (arm, entries) in itertools.product(numbers, study.arms.items()):
+            if only not in arm:
+                continue
+            config = settings(entries | changes, seed)
+            key = essence(config)
+            if key in jobs:
+                conditions = jobs[key].conditions or study.conditions
+                jobs[key] = dataclasses.replace(jobs[key], conditions=conditions)
+                continue
+            path = existing.get(key) or _free(parent / f"{name}-{arm}-s{seed}", taken)
+            taken.add(path)
+            jobs[key] = Job(path, config, study.conditions)
+    return list(jobs.values())
+
+
+def _free(path: Path, taken: set[Path]) -> Path:
+    """The path, or with -2, -3 ... appended if a run of other settings is there."""
+    numbered = (path.with_name(f"{path.name}-{count}") for count in itertools.count(2))
+    return next(p for p in itertools.chain([path], numbered) if not p.exists() and p not in taken)
+
+
+def execute(jobs: Sequence[Job], workers: int) -> int:
+    """Do the jobs, each in a process of its own; how many failed.
+
+    Raises:
+        Interrupted: after every run was saved.
+    """
+    todo = [job for job in jobs if not job.done()]
+    say(f"{len(jobs)} runs, {len(jobs) - len(todo)} of them finished")
+    failed = 0
+    total = sum(job.config.trials for job in todo)
+    with SignalTrap() as trap, tqdm(total=total, unit="trial", disable=not todo) as bar:
+        parallel = Parallel(n_jobs=workers, backend="threading", return_as="generator_unordered")
+        tasks = (delayed(watch)(i, j.path, _command(j), bar, trap) for i, j in enumerate(todo))
+        for _, path, code, message in parallel(tasks):
+            if not code:
+                bar.set_description(path.name)
+            elif not trap.number:
+                failed += 1
+                say(f"failed: {path}, {message}")
+    if trap.number:
+        raise Interrupted(trap.number)
+    return failed
+
+
+def _command(job: Job) -> list[str]:
+    text = json.dumps(dataclasses.asdict(job.config))
+    return [sys.executable, "-c", WORK, str(job.path), text, "conditions" * job.conditions]
+
+
+# ------------------------------------------------------------------------------- a single run
+
+
+@arithmetic()
+def work(directory: str, text: str, conditions: str = "") -> int:
+    """Train, evaluate and play in other conditions what is not done yet; the exit code."""
+    path, config = Path(directory), from_dict(json.loads(text))
+    wall, cpu, code = time.perf_counter(), time.process_time(), 0
+    try:
+        if not (path / "evaluation.json").exists():
+            _write(path / "evaluation.json", _train_and_evaluate(path, config))
+        if conditions and not (path / "conditions.json").exists():
+            diverged = "diverged" in json.loads((path / "evaluation.json").read_bytes())
+            _write(path / "conditions.json", [] if diverged else under_conditions(path))
+    except (ValueError, OSError, ArithmeticError) as error:
+        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
+        code = 2
+    except (Interrupted, KeyboardInterrupt) as stop:
+        code = 128 + getattr(stop, "number", 2)
+    if path.is_dir():
+        spent = [time.perf_counter() - wall, time.process_time() - cpu]
+        with open(path / "seconds.csv", "a") as file:  # a line for each sitting
+            file.write(f"{spent[0]:.1f},{spent[1]:.1f}\n")
+    return code
+
+
+def _train_and_evaluate(path: Path, config: Config) -> dict[str, Any]:
+    options = training.RunOptions(
+        runs=path.parent, name=path.name, picture_every=0, video_every=0, quiet=True
+    )
+    try:
+        if (path / "config.json").exists():
+            training.resume(path, options)
+        else:
+            training.train(config, options)
+    except Divergence as error:  # a result too
+        return {"diverged": str(error)}
+    config, agent, _, _ = evaluate.load(path)
+    results: dict[str, Any] = {"episodes": EPISODES, "seed": 1000 + config.seed}
+    for policy in ("greedy", "sampled"):
+        explore = policy == "sampled"
+        records = evaluate.evaluate(config, agent, EPISODES, explore, results["seed"])
+        results[policy] = [dataclasses.asdict(record) for record in records]
+    if read_column(path / "trials.csv", "success")[-1]:
+        record, trajectory = last_trial(path)
+        results["last_trial"] = {
+            "steps": record.steps,
+            "true": trajectory.true.round(5).tolist(),
+            "estimated": trajectory.estimated.round(5).tolist(),
+        }
+    return results
+
+
+def last_trial(path: Path) -> tuple[TrialRecord, Trajectory]:
+    """The last trial of a finished run, played once more from the last checkpoint before it.
+
+    Raises:
+        CheckpointError: the checkpoint cannot be used.
+    """
+    file = checkpoint.checkpoints(path)[1]
+    config, state = directory.load_config(path), checkpoint.load(file)
+    agent, env = session.build(config)
+    checkpoint.restore(file, state, agent, env)
+    for _ in range(state["trial"], config.trials):
+        record, trajectory = training.play(env, agent)
+    env.close()
+    return record, trajectory
+
+
+def _write(path: Path, data: Any) -> None:
+    checkpoint.write_atomically(path, json.dumps(data).encode())
