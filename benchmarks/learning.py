@@ -23,7 +23,7 @@ from timing import arguments, interleaved, median, ratio, report
 from torch import Tensor
 
 from sofnn_torch.network.sofnn import SOFNN
-from sofnn_torch.runs.factory import Agent, make_agent
+from sofnn_torch.runs.factory import POSE, Agent, make_agent
 from sofnn_torch.runs.presets import preset
 from sofnn_torch.runs.session import arithmetic
 
@@ -122,7 +122,7 @@ def additions(repeats: int) -> list[dict[str, Any]]:
         means = []
         for _ in range(max(3, repeats // 5)):
             # So narrow that every state is new; so the capacity of the table doubles once.
-            net = SOFNN(3, 3, width=1e-3, periods=(0, 0, 2 * np.pi), interpolate=interpolate)
+            net = SOFNN(POSE, 3, width=1e-3, interpolate=interpolate)
             fill(net, SIZES[-1])
             differences = []
             for x in torch.from_numpy(states(SIZES[-1], seed=2)):

@@ -21,6 +21,7 @@ from timing import arguments, interleaved, median, ratio, report
 from torch import Tensor
 
 from sofnn_torch.network.sofnn import SOFNN
+from sofnn_torch.runs.factory import POSE
 from sofnn_torch.runs.presets import preset
 from sofnn_torch.runs.session import arithmetic
 
@@ -70,7 +71,7 @@ def main() -> None:
     xs = torch.from_numpy(states(2_000, seed=1))
     rows = []
     for rules in SIZES:
-        net = SOFNN(3, 3, width=widths, periods=(0, 0, 2 * math.pi))
+        net = SOFNN(POSE, 3, width=widths)
         fill(net, rules)
         for reach in REACHES:
             cells = Cells(net, reach * config.width_position)

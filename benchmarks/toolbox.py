@@ -20,6 +20,7 @@ from neuro_fuzzy_toolbox.func import Gaussian_MF
 from neuro_fuzzy_toolbox.models.anfis import rule_reduced_ANFIS
 from timing import arguments, interleaved, median, ratio, report
 
+from sofnn_torch.network.axes import Axis
 from sofnn_torch.network.sofnn import SOFNN
 from sofnn_torch.runs.session import arithmetic
 
@@ -27,7 +28,8 @@ from sofnn_torch.runs.session import arithmetic
 def ours(rules: int, period: float = 0.0) -> SOFNN:
     """Return a growing network with a number of rules; the third input may have a period."""
     widths = (0.06, 0.06, 0.45)
-    net = SOFNN(3, 4, width=widths, periods=(0, 0, period), interpolate=False)
+    axes = Axis("x"), Axis("y"), Axis("heading", period=period)
+    net = SOFNN(axes, 4, width=widths, interpolate=False)
     fill(net, rules)
     return net
 

@@ -16,6 +16,7 @@ import neighbours
 import training
 
 from sofnn_torch.network.sofnn import SOFNN
+from sofnn_torch.runs.factory import POSE
 
 
 def test_training_is_measured_for_both_learners_and_both_physics(tmp_path, monkeypatch, capsys):
@@ -65,9 +66,9 @@ def test_the_measured_learner_keeps_its_number_of_rules(name):
 
 
 def test_the_near_rules_miss_no_more_than_the_bound():
-    widths, reach, periods = [0.06, 0.06, 0.45], 7.0, (0, 0, 2 * math.pi)
+    widths, reach = [0.06, 0.06, 0.45], 7.0
     # In single precision rounding alone would be more than the bound.
-    net = SOFNN(3, 3, width=widths, periods=periods, theta=0.4, dtype=torch.float64)
+    net = SOFNN(POSE, 3, width=widths, theta=0.4, dtype=torch.float64)
     xs = torch.from_numpy(learning.states(3_000, seed=3)).double()
     for x in xs:
         net.grow(x)

@@ -10,14 +10,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sofnn_torch.network import batches
+from sofnn_torch.network.axes import Axis
 from sofnn_torch.network.sofnn import SOFNN, grid
 
 TAU = 2 * math.pi
+POSE = (
+    Axis("x", "m", 0, 1),
+    Axis("y", "m", 0, 1),
+    Axis("heading", "rad", -math.pi, math.pi, period=TAU),
+)
 
 
 def network(n_outputs=2, **settings):
-    settings = {"width": [0.1, 0.1, 0.5], "periods": [0, 0, TAU], "dtype": torch.float64} | settings
-    return SOFNN(3, n_outputs, **settings)
+    settings = {"width": [0.1, 0.1, 0.5], "dtype": torch.float64} | settings
+    return SOFNN(POSE, n_outputs, **settings)
 
 
 def states(count, seed=0):
@@ -119,7 +125,7 @@ def test_factors_are_double_where_single_precision_would_not_do():
 
 
 def test_a_batch_takes_centres_of_any_turn():
-    net = network(periods=[0, 0, TAU])
+    net = network()
     for turns in (-2, 0, 1, 3):
         net.add_rule(torch.tensor([0.5, 0.1 * turns, 0.3 + turns * TAU]).double())
     x = states(batches.LARGE)
@@ -365,7 +371,7 @@ def test_ordinary_optimizers_reach_the_parameters():
 
 
 def test_grid_is_regular_and_frozen():
-    net = grid([0, 0, -math.pi], [1, 1, math.pi], (12, 12, 8), 3, periods=[0, 0, TAU])
+    net = grid(POSE, (12, 12, 8), 3)
     assert net.n_rules == 1152
     assert not net.grow(torch.tensor([7.0, 7.0, 0.0]))
     assert net.centres.unique(dim=0).shape[0] == 1152
@@ -395,7 +401,6 @@ def test_the_cap_refuses_rules_and_counts():
         ({"width": 0.0}, "width"),
         ({"width": math.nan}, "width"),
         ({"width": [0.1, 0.1]}, "width"),
-        ({"periods": -1.0}, "period"),
         ({"growth": "wild"}, "growth"),
         ({"max_rules": 0}, "max_rules"),
     ],
@@ -403,6 +408,40 @@ def test_the_cap_refuses_rules_and_counts():
 def test_bad_settings_are_refused_by_name(settings, message):
     with pytest.raises(ValueError, match=message):
         network(**settings)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"low": 1.0, "high": 1.0}, "heading: low"),
+        ({"low": math.nan}, "heading: low"),
+        ({"period": -1.0}, "heading: the period"),
+        ({"period": math.inf}, "heading: the period"),
+        ({"period": math.nan}, "heading: the period"),
+    ],
+)
+def test_an_axis_needs_a_range_and_a_period_that_can_be(settings, message):
+    with pytest.raises(ValueError, match=message):
+        Axis("heading", "rad", **settings)
+
+
+def test_inputs_without_a_description_are_numbered_and_endless():
+    assert SOFNN(2, 1, width=0.1).axes == (Axis("x1"), Axis("x2"))
+
+
+@pytest.mark.parametrize("inputs", [0, [], [Axis("x"), Axis("x")]])
+def test_every_input_needs_a_name_of_its_own(inputs):
+    with pytest.raises(ValueError, match="input"):
+        SOFNN(inputs, 1, width=0.1)
+
+
+@pytest.mark.parametrize(
+    ("axes", "shape", "message"),
+    [(POSE, (3, 3), "counts"), (POSE, (3, 3, 0), "counts"), ([Axis("speed")], (3,), "speed")],
+)
+def test_a_grid_needs_ends_and_a_count_for_each_axis(axes, shape, message):
+    with pytest.raises(ValueError, match=message):
+        grid(axes, shape, 1)
 
 
 def test_an_empty_network_says_what_to_do():

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from sofnn_torch.learners.qlearning import QConfig, QLearning, code_length
+from sofnn_torch.network.axes import Axis
 from sofnn_torch.network.sofnn import SOFNN
 
 N, TAU = 3, 2 * math.pi
@@ -28,11 +29,10 @@ def learner(coding="onehot", rules=25, seed=0, segments=3, n_outputs=None, **set
     inputs = N + (coding == "antecedent")
     outputs = n_outputs or N + code_length(coding, segments) + 1
     net = SOFNN(
-        inputs,
+        [Axis("x"), Axis("y"), Axis("heading", period=TAU), Axis("action")][:inputs],
         outputs,
         width=[0.3, 0.3, 1.0, 0.5][:inputs],
         theta=0.5,
-        periods=[0, 0, TAU, 0][:inputs],
         block_size=8,
         dtype=torch.float64,
     )

@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sofnn_torch.learners.sga import LEFT, RIGHT, SGA, STRAIGHT, SGAConfig, log_likelihood
+from sofnn_torch.network.axes import Axis
 from sofnn_torch.network.sofnn import SOFNN
 
 N, TAU = 3, 2 * math.pi
@@ -20,11 +21,10 @@ def learner(m=1, rules=30, seed=0, baseline="value", n_outputs=None, **settings)
     torch.manual_seed(seed)
     learned = int(baseline == "value")
     net = SOFNN(
-        N,
+        [Axis("x"), Axis("y"), Axis("heading", period=TAU)],
         n_outputs or 2 * m + learned,
         width=[0.3, 0.3, 1.0],
         theta=0.5,
-        periods=[0, 0, TAU],
         initial=0.3,
         block_size=8,
         dtype=torch.float64,

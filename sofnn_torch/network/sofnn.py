@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 
 from sofnn_torch.network import batches
+from sofnn_torch.network.axes import Axis, named
 from sofnn_torch.network.table import RuleTable
 
 Growth = Literal["rule", "input", "literal", "frozen"]
@@ -32,7 +33,8 @@ class SOFNN(RuleTable):
     rules, ``B`` states in a batch, ``F`` features of a state.
 
     Args:
-        n_inputs: number of inputs ``n``.
+        inputs: the axes of the ``n`` inputs, or how many: then they are called x1, x2, ...
+            and none has ends or wraps.
         n_outputs: number of consequents per rule ``m``.
         width: width given to new membership functions, one for all inputs or one each.
         theta: growth threshold ``theta_th`` of equation 3, in (0, 1).
@@ -41,7 +43,6 @@ class SOFNN(RuleTable):
             membership function, and each newly met combination of best membership functions
             becomes a rule. ``literal``: a rule is added when no membership of any input
             reaches theta. ``frozen``: the structure never changes (FSFNN).
-        periods: period of each input, 0 for an input that does not wrap (2 pi for an angle).
         initial: consequents of a new rule, one for all or one each.
         interpolate: give a new rule the network's present output instead of ``initial``, so that
             the output at its centre does not change; one for all consequents or one each (the
@@ -57,13 +58,12 @@ class SOFNN(RuleTable):
 
     def __init__(
         self,
-        n_inputs: int,
+        inputs: int | Sequence[Axis],
         n_outputs: int,
         *,
         width: float | Sequence[float],
         theta: float = 0.4,
         growth: Growth = "rule",
-        periods: Sequence[float] | None = None,
         initial: float | Sequence[float] = 0.0,
         interpolate: bool | Sequence[bool] = True,
         max_rules: int = 100_000,
@@ -71,6 +71,8 @@ class SOFNN(RuleTable):
         block_size: int = 1024,
         dtype: torch.dtype = torch.float32,
     ):
+        self.axes = named(inputs)
+        n_inputs = len(self.axes)
         super().__init__(
             n_inputs,
             n_outputs,
@@ -98,11 +100,9 @@ class SOFNN(RuleTable):
         mask = per(interpolate, n_outputs, "interpolate").bool()
         self.register_buffer("interpolate", mask, persistent=False)
         self.interpolates = bool(mask.any())
-        periods = per(0.0 if periods is None else periods, n_inputs, "periods")[:, None]
         if not (self.default_width >= min_width).all():
             raise ValueError(f"every width must be at least {min_width}, got {width}")
-        if (periods < 0).any():
-            raise ValueError("a period is positive, or 0 for an input that does not wrap")
+        periods = torch.tensor([[axis.period] for axis in self.axes], dtype=dtype)
         self.register_buffer("periods", periods, persistent=False)  # (n, 1)
         self.wrapping: batches.Wrapping = [
             (i, (1 / period).item(), period.item())
@@ -305,34 +305,32 @@ class SOFNN(RuleTable):
         }
 
 
-def grid(
-    lows: Sequence[float], highs: Sequence[float], shape: Sequence[int], n_outputs: int, **settings
-) -> SOFNN:
+def grid(axes: Sequence[Axis], shape: Sequence[int], n_outputs: int, **settings) -> SOFNN:
     """Fixed-structure twin (FSFNN): a regular grid of rules whose structure is frozen.
 
     Args:
-        lows: lower end of each input; a periodic input needs highs - lows = its period.
-        highs: upper end of each input.
+        axes: the inputs; the grid fills their ranges, for one that wraps a whole period.
         shape: rules along each input, e.g. (12, 12, 8) for the paper's 1152.
         n_outputs: consequents per rule.
         **settings: keyword arguments of `SOFNN`; the default width is half the grid's spacing.
 
     Raises:
-        ValueError: lengths differ, a range is empty or a count is not positive.
+        ValueError: lengths differ, an axis has no ends or a count is not positive.
     """
-    if not len(lows) == len(highs) == len(shape):
-        raise ValueError(f"lows, highs and shape differ in length: {lows}, {highs}, {shape}")
-    if any(s < 1 for s in shape) or any(h <= lo for lo, h in zip(lows, highs, strict=True)):
-        raise ValueError(f"a grid needs positive counts and non-empty ranges: {shape}")
-    spacing = [(h - lo) / s for lo, h, s in zip(lows, highs, shape, strict=True)]
+    if len(axes) != len(shape) or any(s < 1 for s in shape):
+        raise ValueError(f"a grid over {len(axes)} axes needs as many positive counts, got {shape}")
+    endless = [axis.name for axis in axes if not axis.bounded]
+    if endless:
+        raise ValueError(f"a grid needs axes with a low and a high end: {', '.join(endless)}")
+    spacing = [(axis.high - axis.low) / s for axis, s in zip(axes, shape, strict=True)]
     settings = {"width": [s / 2 for s in spacing], **settings, "growth": "frozen"}
     count = torch.Size(shape).numel()
-    net = SOFNN(len(shape), n_outputs, block_size=count, max_rules=count, **settings)
-    axes = [
-        lo + step * (torch.arange(s, dtype=torch.float64) + 0.5)
-        for lo, step, s in zip(lows, spacing, shape, strict=True)
+    net = SOFNN(axes, n_outputs, block_size=count, max_rules=count, **settings)
+    places = [
+        axis.low + step * (torch.arange(s, dtype=torch.float64) + 0.5)
+        for axis, step, s in zip(axes, spacing, shape, strict=True)
     ]
-    centres = torch.cartesian_prod(*axes).reshape(count, len(shape))
+    centres = torch.cartesian_prod(*places).reshape(count, len(shape))
     per_rule = [row.expand(count, -1) for row in (net.default_width, net.initial)]
     net.replace_rules(centres, *per_rule)
     return net
