@@ -19,7 +19,7 @@ from learning import SIZES, both_passes, decide, fill, learner, states
 from timing import arguments, interleaved, median, ratio, report
 from torch import Tensor
 
-from sofnn_torch.learners.sga import SGA, surprise
+from sofnn_torch.learners.sga import SGA, negative_log_likelihood
 from sofnn_torch.network.sofnn import SOFNN
 from sofnn_torch.runs.session import arithmetic
 
@@ -87,14 +87,14 @@ class Decision:
         usage.add_(firing)
         error = reward + agent.gamma * (consequents[-1] @ firing) - value
         mean, deviation, values = (consequents + error * agent.rates * traces).unbind()
-        mean = mean.clamp(-agent.config.mean_limit, agent.config.mean_limit)
-        deviation = deviation.clamp(agent.config.sigma_min, agent.config.sigma_max)
+        mean = mean.clamp(-agent.settings.mean_limit, agent.settings.mean_limit)
+        deviation = deviation.clamp(agent.settings.sigma_min, agent.settings.sigma_max)
         updated = torch.stack([mean, deviation, values])
 
         def objective(consequents: Tensor) -> tuple[Tensor, Tensor]:
             mean, deviation, value = (consequents @ firing).split(1)
             action = (mean + deviation * noise).detach()
-            likely = -surprise(action, mean, deviation) * deviation.detach().square()
+            likely = -negative_log_likelihood(action, mean, deviation) * deviation.detach().square()
             return (likely + value).sum(), torch.cat([mean, deviation, value, action])
 
         eligibility, numbers = torch.func.grad(objective, has_aux=True)(updated)

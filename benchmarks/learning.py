@@ -22,10 +22,11 @@ import torch
 from timing import arguments, interleaved, median, ratio, report
 from torch import Tensor
 
+from sofnn_torch.learners.learner import Learner
 from sofnn_torch.network.sofnn import SOFNN
-from sofnn_torch.runs.factory import POSE, Agent, make_agent
-from sofnn_torch.runs.presets import preset
+from sofnn_torch.runs.factory import make_agent
 from sofnn_torch.runs.session import arithmetic
+from sofnn_torch.runs.settings import POSE, Config
 
 SIZES = (1_000, 10_000)
 GROWTH = (10, 30, 100, 300, 1_000, 3_000, 10_000, 30_000, 100_000)
@@ -44,9 +45,9 @@ def fill(net: SOFNN, rules: int) -> None:
         net.add_rule(centre, consequents=net.initial)
 
 
-def learner(name: str, rules: int, adapting: bool = False) -> Agent:
+def learner(name: str, rules: int, adapting: bool = False) -> Learner:
     """Return a learner with the default settings and a number of rules that stays."""
-    config = preset(name, "sofnn", "default")
+    config = Config(agent=name, network="sofnn")
     part = getattr(config, name)
     if adapting:
         part = dataclasses.replace(part, rate_centre=1e-6, rate_width=1e-6)
@@ -57,7 +58,7 @@ def learner(name: str, rules: int, adapting: bool = False) -> Agent:
     return agent
 
 
-def decide(agent: Agent) -> Callable[[], Any]:
+def decide(agent: Learner) -> Callable[[], Any]:
     """Return a function that learns from one decision."""
     observations = cycle(list(states(5_000, seed=1)))
     agent.start(next(observations))

@@ -21,9 +21,8 @@ from timing import arguments, interleaved, median, ratio, report
 from torch import Tensor
 
 from sofnn_torch.network.sofnn import SOFNN
-from sofnn_torch.runs.factory import POSE
-from sofnn_torch.runs.presets import preset
 from sofnn_torch.runs.session import arithmetic
+from sofnn_torch.runs.settings import POSE, Config
 
 SIZES = (1_000, 10_000, 100_000)
 REACHES = (4.0, 7.0)  # widths
@@ -66,7 +65,7 @@ def error(net: SOFNN, cells: Cells, xs: Tensor) -> float:
 def main() -> None:
     """Measure, print a table, and write it as JSON."""
     options = arguments(__doc__, repeats=15)
-    config = preset("sga", "sofnn", "default").net
+    config = Config(agent="sga", network="sofnn").net
     widths = (config.width_position, config.width_position, config.width_heading)
     xs = torch.from_numpy(states(2_000, seed=1))
     rows = []

@@ -20,8 +20,8 @@ import tyro
 
 from sofnn_torch import training
 from sofnn_torch.pictures import figures
-from sofnn_torch.runs.presets import preset
 from sofnn_torch.runs.session import RunOptions
+from sofnn_torch.runs.settings import Config
 from sofnn_torch.runs.signals import Interrupted
 
 
@@ -70,7 +70,7 @@ def _ends(table: Path) -> tuple[list[str], list[str]]:
 def main() -> None:
     """Train, sample, report."""
     soak = tyro.cli(Soak, description=__doc__)
-    config = replace(preset(soak.agent, "sofnn", "default"), trials=1_000_000)
+    config = replace(Config(agent=soak.agent, network="sofnn"), trials=1_000_000)
     samples: list[dict[str, float]] = []
     over = threading.Event()
     with tempfile.TemporaryDirectory() as runs:

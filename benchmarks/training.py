@@ -33,8 +33,8 @@ from sofnn_torch import training
 from sofnn_torch.maze.odometry import WHEEL_RADIUS
 from sofnn_torch.maze.robot import Physics
 from sofnn_torch.runs import session
-from sofnn_torch.runs.presets import preset
 from sofnn_torch.runs.session import RunOptions, Session, arithmetic
+from sofnn_torch.runs.settings import Config
 from sofnn_torch.runs.signals import SignalTrap
 
 MAX_STEPS = 2_000  # of a trial
@@ -50,7 +50,7 @@ def fresh(
     name: str, rules: int, model: mujoco.MjModel | None, trials: int, replay: bool
 ) -> Callable[..., Any]:
     """Return a function that begins a run in a directory."""
-    config = preset(name, "sofnn", "default")
+    config = Config(agent=name, network="sofnn")
     if not replay:
         part = dataclasses.replace(getattr(config, name), replays=0)
         config = dataclasses.replace(config, **{name: part})

@@ -1,23 +1,69 @@
-"""Self-organized fuzzy-neuro reinforcement learning for a wheeled robot, in PyTorch and MuJoCo."""
+"""Self-organizing fuzzy neural networks that learn by reinforcement, in PyTorch and MuJoCo.
 
-import os
-import sys
+    from sofnn_torch import SOFNN, Axis, grid, train, load
+
+The network and the learners load without MuJoCo; the rest loads when it is first asked for.
+"""
+
+import importlib
+from typing import TYPE_CHECKING, Any
 
 from gymnasium.envs.registration import register
 
-__version__ = "0.1.0"
+if TYPE_CHECKING:
+    from sofnn_torch.evaluate import load
+    from sofnn_torch.learners import SGA, Learner, QConfig, QLearning, SGAConfig, Task
+    from sofnn_torch.maze.env import KheperaMazeEnv
+    from sofnn_torch.maze.settings import MazeConfig
+    from sofnn_torch.network.axes import Axis
+    from sofnn_torch.network.settings import NetworkConfig
+    from sofnn_torch.network.sofnn import SOFNN, grid
+    from sofnn_torch.runs.session import RunOptions
+    from sofnn_torch.runs.settings import Config
+    from sofnn_torch.training import resume, train
 
-try:
-    import mujoco  # noqa: F401
-except Exception as error:  # MuJoCo looks at MUJOCO_GL when it loads and then raises all kinds
-    if "MUJOCO_GL" not in os.environ:
-        raise
-    reason = " ".join(str(error).split())
-    print(
-        f"error: MuJoCo does not load with MUJOCO_GL={os.environ['MUJOCO_GL']} ({reason}): "
-        "set it to egl, osmesa or glfw, or unset it",
-        file=sys.stderr,
-    )
-    sys.exit(2)  # nothing works without it, and every command ends here in one line
+__version__ = "0.2.0"
+
+PLACES = {
+    "network.sofnn": ("SOFNN", "grid"),
+    "network.axes": ("Axis",),
+    "learners": ("SGA", "SGAConfig", "QLearning", "QConfig", "Learner", "Task"),
+    "maze.env": ("KheperaMazeEnv",),
+    "runs.settings": ("Config", "MazeConfig", "NetworkConfig"),
+    "runs.session": ("RunOptions",),
+    "training": ("train", "resume"),
+    "evaluate": ("load",),
+}
+HOMES = {name: f"sofnn_torch.{module}" for module, names in PLACES.items() for name in names}
+
+__all__ = [
+    "SGA",
+    "SOFNN",
+    "Axis",
+    "Config",
+    "KheperaMazeEnv",
+    "Learner",
+    "MazeConfig",
+    "NetworkConfig",
+    "QConfig",
+    "QLearning",
+    "RunOptions",
+    "SGAConfig",
+    "Task",
+    "grid",
+    "load",
+    "resume",
+    "train",
+]
 
 register(id="KheperaMaze-v0", entry_point="sofnn_torch.maze.env:KheperaMazeEnv")
+
+
+def __getattr__(name: str) -> Any:
+    if name not in HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(HOMES[name]), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *HOMES})

@@ -19,9 +19,9 @@ if __name__ == "__main__":  # Ctrl-C while libraries load: there is nothing to s
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 from sofnn_torch import training
+from sofnn_torch.bounds import Count, Settings
 from sofnn_torch.runs import directory, parallel
 from sofnn_torch.runs.guard import Divergence
-from sofnn_torch.runs.presets import preset
 from sofnn_torch.runs.session import RunOptions, home_of, saved_config
 from sofnn_torch.runs.settings import Config
 from sofnn_torch.runs.signals import Interrupted
@@ -41,7 +41,7 @@ Ctrl-C saves. Watch with: tensorboard --logdir runs
 
 
 @dataclass(frozen=True)
-class Flags:
+class Flags(Settings):
     """All flags of the command line."""
 
     config: Annotated[Config, tyro.conf.arg(name="")]
@@ -51,7 +51,7 @@ class Flags:
     are kept; only `--trials` may be raised."""
     seeds: Annotated[str | None, tyro.conf.arg(metavar="LIST")] = None
     """Train several seeds, each in its own process and run: `0-7` or `0,3,5`."""
-    workers: int = 1
+    workers: Count = 1
     """Seeds that are trained at the same time (with `--seeds`)."""
     replay: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Play the trial again that follows a saved state, such as a `divergence-12.pt`."""
@@ -106,8 +106,6 @@ def parse(argv: Sequence[str]) -> Flags:
     _refuse_idle(flags, unchanged)
     if flags.seeds is not None and flags.config.seed != base.seed:
         raise ValueError("--seed and --seeds exclude each other")
-    if flags.workers < 1:
-        raise ValueError(f"--workers must be at least 1, got {flags.workers}")
     return flags
 
 
@@ -118,7 +116,7 @@ class _Parser(argparse.ArgumentParser):
 
 def _preset(known: argparse.Namespace) -> Config:
     try:
-        return preset(known.agent, known.network, known.preset)
+        return Config(agent=known.agent, network=known.network, preset=known.preset)
     except ValueError:
         return Config()  # no such preset: all flags are checked next
 

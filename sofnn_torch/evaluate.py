@@ -17,7 +17,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import imageio.v2 as imageio
 import numpy as np
@@ -26,11 +26,13 @@ from rich.console import Console
 from rich.table import Table
 from scipy import stats
 
+from sofnn_torch.bounds import Count, Settings, Within
+from sofnn_torch.learners.learner import Learner
 from sofnn_torch.maze.optimum import optimal_steps
 from sofnn_torch.pictures.film import film, gif
 from sofnn_torch.runs import checkpoint
 from sofnn_torch.runs.directory import same_settings, versions
-from sofnn_torch.runs.factory import Agent, make_agent, make_env
+from sofnn_torch.runs.factory import make_agent, make_env
 from sofnn_torch.runs.session import arithmetic, saved_config
 from sofnn_torch.runs.settings import Config
 from sofnn_torch.runs.trial import TrialRecord
@@ -41,18 +43,18 @@ CONFIDENCE = 0.95
 
 
 @dataclass(frozen=True)
-class Options:
+class Options(Settings):
     """Play the learned policy of a run and print steps, success, collisions and pose error."""
 
     run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
     """Directory of the run, or one of its checkpoint files."""
-    episodes: int = 10
+    episodes: Count = 10
     """Trials to play."""
     explore: bool = False
     """Sample the learned stochastic policy instead of its mean or greedy action."""
     best: bool = False
     """Take the checkpoint with the best last 10 trials instead of the latest."""
-    seed: int = 1000
+    seed: Annotated[int, Within(least=0)] = 1000
     """Seed of the motor noise and of the sampled actions."""
     video: Path | None = None
     """Write a video of the first trial to this .mp4 or .gif file."""
@@ -77,10 +79,6 @@ def check(options: Options) -> None:
     Raises:
         ValueError: naming the flag.
     """
-    if options.episodes < 1:
-        raise ValueError(f"--episodes must be at least 1, got {options.episodes}")
-    if options.seed < 0:
-        raise ValueError(f"--seed must not be negative, got {options.seed}")
     if options.video and options.video.suffix not in (".mp4", ".gif"):
         raise ValueError(f"--video must end in .mp4 or .gif, got {options.video}")
     for flag, path in (("--video", options.video), ("--json", options.json)):
@@ -88,7 +86,16 @@ def check(options: Options) -> None:
             raise ValueError(f"{flag} {path}: not a file in an existing directory")
 
 
-def load(run: Path, best: bool = False) -> tuple[Config, Agent, Path, dict[str, Any]]:
+class Loaded(NamedTuple):
+    """What `load` found of a run: its settings, the learner, and the checkpoint and its state."""
+
+    config: Config
+    agent: Learner
+    file: Path
+    state: dict[str, Any]
+
+
+def load(run: Path | str, best: bool = False) -> Loaded:
     """Settings, learner, file and state of the latest good checkpoint of a run, or of its best.
 
     Args:
@@ -98,6 +105,7 @@ def load(run: Path, best: bool = False) -> tuple[Config, Agent, Path, dict[str, 
     Raises:
         ValueError: neither of them, or no checkpoint that fits its settings.
     """
+    run = Path(run)
     config = saved_config(run)
     if best and run.is_file():
         raise ValueError(f"--best chooses a checkpoint of a run directory, and {run} is a file")
@@ -114,10 +122,10 @@ def load(run: Path, best: bool = False) -> tuple[Config, Agent, Path, dict[str, 
     env.close()
     if agent.net.n_rules == 0:
         raise ValueError(f"{path}: no rule has been learned yet; train for a trial at least")
-    return config, agent, path, state
+    return Loaded(config, agent, path, state)
 
 
-def learned(agent: Agent, path: Path, state: dict[str, Any]) -> str:
+def learned(agent: Learner, path: Path, state: dict[str, Any]) -> str:
     """For the terminal: what was loaded, in numbers."""
     trials, rules = plural(state["trial"], "trial"), plural(agent.net.n_rules, "rule")
     return f"{path}: {trials} learned, {rules}"
@@ -125,10 +133,10 @@ def learned(agent: Agent, path: Path, state: dict[str, Any]) -> str:
 
 def evaluate(
     config: Config,
-    agent: Agent,
-    episodes: int = 10,
+    agent: Learner,
+    episodes: Count = 10,
     explore: bool = False,
-    seed: int = 1000,
+    seed: Annotated[int, Within(least=0)] = 1000,
     render_mode: str | None = None,
 ) -> list[TrialRecord]:
     """Play trials without learning.
@@ -144,7 +152,7 @@ def evaluate(
     env = make_env(config, render_mode=render_mode)
     try:
         env.reset(seed=seed)
-        agent.rng = np.random.default_rng(seed)
+        agent.reseed(seed)
         records = []
         for trial in range(1, episodes + 1):
             record, _ = play(env, agent, learn=False, explore=explore)
@@ -233,7 +241,7 @@ def plain(row: Estimate) -> dict[str, float | None]:
     return {k: None if math.isnan(v) else v for k, v in dataclasses.asdict(row).items()}
 
 
-def write_video(path: Path, config: Config, agent: Agent, seed: int, explore: bool) -> None:
+def write_video(path: Path, config: Config, agent: Learner, seed: int, explore: bool) -> None:
     """Film the first trial that `evaluate` plays with the same seed, 30 times as fast as it is."""
     if path.suffix == ".gif":
         path.write_bytes(gif(film(config, agent, seed, explore, steps_per_frame=5, size=360)))
@@ -252,7 +260,7 @@ def run(options: Options) -> dict[str, Estimate]:
     """
     check(options)
     config, agent, path, state = load(options.run, options.best)
-    policy = "sampled" if options.explore else "mean" if config.agent == "sga" else "greedy"
+    policy = "sampled" if options.explore else agent.greedy
     records = evaluate(
         config,
         agent,

@@ -15,9 +15,9 @@ import numpy as np
 from tqdm import tqdm
 
 from sofnn_torch.learners.frozen import FrozenPolicy
+from sofnn_torch.learners.learner import Learner
 from sofnn_torch.pictures.tensorboard import Monitor
 from sofnn_torch.runs import checkpoint, session
-from sofnn_torch.runs.factory import Agent
 from sofnn_torch.runs.guard import Divergence, diagnose, physics_warnings
 from sofnn_torch.runs.session import RunOptions, Session, arithmetic, environment_seed
 from sofnn_torch.runs.settings import Config, from_dict
@@ -29,7 +29,7 @@ __all__ = ["RunOptions", "environment_seed", "play", "replay", "resume", "train"
 
 
 def play(
-    env, agent: Agent, learn: bool = True, explore: bool = True, trap: SignalTrap | None = None
+    env, agent: Learner, learn: bool = True, explore: bool = True, trap: SignalTrap | None = None
 ) -> tuple[TrialRecord, Trajectory]:
     """One trial from the start to the goal or the trial's limit.
 
@@ -114,7 +114,7 @@ def train(config: Config, options: RunOptions | None = None) -> Path:
         return _loop(session.begin(config, options), options, trap)
 
 
-def resume(path: Path, options: RunOptions | None = None, trials: int | None = None) -> Path:
+def resume(path: Path | str, options: RunOptions | None = None, trials: int | None = None) -> Path:
     """Go on with a run, bit for bit as if it had never stopped; its directory.
 
     Args:
@@ -129,7 +129,7 @@ def resume(path: Path, options: RunOptions | None = None, trials: int | None = N
     """
     options = options or RunOptions()
     with SignalTrap() as trap, arithmetic(options.threads):
-        reopened = session.reopen(path, options, trials)
+        reopened = session.reopen(Path(path), options, trials)
         if reopened.trial == reopened.run.config.trials:
             reopened.close()
             say(f"{path} has all its {reopened.trial} trials: go further with --trials N")
@@ -138,13 +138,14 @@ def resume(path: Path, options: RunOptions | None = None, trials: int | None = N
 
 
 @arithmetic()
-def replay(path: Path) -> None:
+def replay(path: Path | str) -> None:
     """Play the trial again that follows a saved state, e.g. that of a divergence.
 
     Raises:
         CheckpointError: the file cannot be used.
         Divergence: the trial diverges (again).
     """
+    path = Path(path)
     state = checkpoint.load(path)
     agent, env = session.build(from_dict(state["config"]))
     checkpoint.restore(path, state, agent, env)

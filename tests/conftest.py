@@ -8,7 +8,6 @@ import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from sofnn_torch.runs import checkpoint
-from sofnn_torch.runs.presets import preset
 from sofnn_torch.runs.settings import Config
 from sofnn_torch.training import RunOptions
 
@@ -17,7 +16,7 @@ torch.set_num_threads(1)
 
 def settings(agent="sga", network="sofnn", pose="estimated", seed=0, trials=4, **parts) -> Config:
     """Settings of a run that takes a second; parts as in net={"theta": 0.5}."""
-    config = preset(agent, network, "default")
+    config = Config(agent=agent, network=network)
     parts = {"maze": {}, "net": {}} | parts
     parts["maze"] = {"max_steps": 120} | parts["maze"]
     if network == "fixed":

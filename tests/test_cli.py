@@ -23,7 +23,6 @@ from sofnn_torch.cli import main, parse
 from sofnn_torch.runs import checkpoint, parallel
 from sofnn_torch.runs.directory import load_config
 from sofnn_torch.runs.factory import make_agent
-from sofnn_torch.runs.presets import preset
 from sofnn_torch.runs.settings import Config, from_dict
 
 ROOT = Path(__file__).parents[1]
@@ -67,7 +66,7 @@ def test_the_help_begins_with_examples_and_shows_every_setting(capsys):
         parse(["--help"])
     assert stop.value.code == 0
     text = capsys.readouterr().out
-    assert text.index("train.py --resume") < text.index("--agent {sga,q}")
+    assert text.index("train.py --resume") < text.index("--agent STR")
     names = [name for name, part in asdict(Config()).items() if not isinstance(part, dict)]
     nested = asdict(Config()).items()
     names += [
@@ -81,7 +80,7 @@ def test_the_help_shows_the_values_of_the_chosen_preset(capsys):
     with pytest.raises(SystemExit):
         parse(["--preset", "paper", "--agent", "q", "--help"])
     text = re.sub(r"[│\s]+", " ", capsys.readouterr().out)
-    rate = preset("q", "sofnn", "paper").q.trace_decay
+    rate = Config(agent="q", network="sofnn", preset="paper").q.trace_decay
     assert f"Lambda of the eligibility traces; 0 in the paper. (default: {rate})" in text
 
 
@@ -91,7 +90,7 @@ def test_the_help_shows_the_values_of_the_chosen_preset(capsys):
 def test_flags_lie_on_top_of_the_preset(agent, network, name):
     words = f"--preset {name} --network={network} --agent {agent} --net.width-position 0.05"
     config = parse(words.split()).config
-    expected = asdict(preset(agent, network, name))
+    expected = asdict(Config(agent=agent, network=network, preset=name))
     expected["net"]["width_position"] = 0.05
     assert asdict(config) == expected
 
@@ -215,7 +214,7 @@ def test_growth_without_end_stops_at_the_limit_and_says_so(agent, here, capsys):
         ("--reusme x", "did you mean --resume?"),
         ("--sga.rate-men 1", "did you mean --sga.rate-mean?"),
         ("extra", "extra"),
-        ("--agent dqn", "--agent must be one of 'sga', 'q', got 'dqn'"),
+        ("--agent dqn", "--agent must be sga, q or module:Class of a learner, got 'dqn'"),
         ("--network lstm", "--network must be one of 'sofnn', 'fixed', got 'lstm'"),
         ("--preset best", "--preset must be one of 'default', 'paper', got 'best'"),
         ("--pose gps", "--pose must be one of 'estimated', 'true', 'odometry', got 'gps'"),

@@ -13,7 +13,7 @@ import pytest
 
 from sofnn_torch import evaluate, terminal
 from sofnn_torch.maze.rendering import RenderingError
-from sofnn_torch.runs.presets import preset
+from sofnn_torch.runs.settings import Config
 from sofnn_torch.runs.trial import TrialRecord
 from sofnn_torch.training import RunOptions, train
 
@@ -23,7 +23,7 @@ RECORD = TrialRecord(1, 500, 60, 500, 1.0, True, 1, 2, 100, 0.003, 0.01, 0.02)
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
     """A run of two short trials; tests must not write into it."""
-    config = preset("sga", "sofnn", "default")
+    config = Config(agent="sga", network="sofnn")
     config = replace(config, trials=2, maze=replace(config.maze, max_steps=120))
     runs = tmp_path_factory.mktemp("runs")
     return train(config, RunOptions(runs=runs, picture_every=0, quiet=True))

@@ -1,4 +1,4 @@
-"""Pictures show what they claim; surveys agree with the learner that they ask."""
+"""Pictures show what they claim; plans agree with the learner that they ask."""
 
 import io
 import math
@@ -10,10 +10,10 @@ import torch
 from matplotlib.patches import Rectangle
 from PIL import Image
 
-from sofnn_torch.learners.survey import survey, usage
+from sofnn_torch.maze.odometry import motion
 from sofnn_torch.pictures import figures
 from sofnn_torch.runs.factory import make_agent, make_env
-from sofnn_torch.runs.presets import preset
+from sofnn_torch.runs.settings import Config
 from sofnn_torch.runs.trial import Trajectory
 
 RNG = np.random.default_rng(7)
@@ -22,7 +22,7 @@ STATES = np.column_stack([RNG.uniform(0, 1, (60, 2)), RNG.uniform(-math.pi, math
 
 @pytest.fixture(scope="module")
 def plan():
-    env = make_env(preset("sga", "sofnn", "default"))
+    env = make_env(Config(agent="sga", network="sofnn"))
     yield env.unwrapped.plan
     env.close()
 
@@ -32,10 +32,11 @@ def axes():
     return figures.canvas()[1][0]
 
 
-def learner(kind, **settings):
+def learner(kind, actions="three", **settings):
     """A learner with rules at STATES and random consequents."""
-    config = preset(kind, "sofnn", "default")
-    config = replace(config, **{kind: replace(getattr(config, kind), **settings)})
+    config = Config(agent=kind, network="sofnn")
+    parts = {kind: replace(getattr(config, kind), **settings)}
+    config = replace(config, maze=replace(config.maze, actions=actions), **parts)
     agent = make_agent(config)
     inputs, outputs = agent.net.n_inputs, agent.net.n_outputs
     rng = np.random.default_rng(3)
@@ -51,21 +52,23 @@ def learner(kind, **settings):
 
 
 @pytest.mark.parametrize("coding", ["onehot", "wheels", "scalar", "antecedent"])
-def test_survey_of_q_agrees_with_the_greedy_action(coding):
+def test_the_plan_of_q_agrees_with_the_greedy_action(coding):
     agent = learner("q", coding=coding)
     turns = [agent.act(state.astype(np.float32)) - 1 for state in STATES]
-    answer = survey(agent, STATES.astype(np.float32))
-    assert answer.turn.tolist() == turns
-    assert answer.forward.tolist() == [1 - abs(turn) for turn in turns]
+    answer = agent.plan(STATES.astype(np.float32))
+    forward, turn = motion(answer.actions)
+    assert turn.tolist() == turns
+    assert forward.tolist() == [1 - abs(turn) for turn in turns]
     state = torch.tensor(STATES[0]).float()
-    firing = agent.net.normalised_firing(agent.inputs(state))
+    firing = agent.net.normalised_firing(agent.network_inputs(state))
     assert answer.value[0] == pytest.approx(agent.action_values(state, firing).max().item(), 1e-4)
 
 
 @pytest.mark.parametrize("actions", ["three", "steer", "wheels"])
-def test_survey_of_sga_agrees_with_the_mean_action(actions):
+def test_the_plan_of_sga_agrees_with_the_mean_action(actions):
     agent = learner("sga", actions=actions)
-    answer = survey(agent, STATES.astype(np.float32))
+    answer = agent.plan(STATES.astype(np.float32))
+    forward, turn = motion(answer.actions)
     for i, state in enumerate(STATES.astype(np.float32)):
         action = agent.act(state)
         if actions == "three":
@@ -74,13 +77,13 @@ def test_survey_of_sga_agrees_with_the_mean_action(actions):
             expected = 1 - abs(action[0]), action[0]
         else:  # the fastest turn, wheels at -0.4 and 0.4, counts as 1
             expected = action.mean(), np.clip((action[1] - action[0]) / 0.8, -1, 1)
-        assert (answer.forward[i], answer.turn[i]) == pytest.approx(expected, abs=1e-5)
+        assert (forward[i], turn[i]) == pytest.approx(expected, abs=1e-5)
     assert answer.value == pytest.approx(agent.net(torch.tensor(STATES).float())[:, -1].detach())
 
 
 def test_a_learner_without_values_has_no_value_field(plan, axes):
     agent = learner("sga", baseline="constant", replays=0)
-    assert survey(agent, STATES).value is None
+    assert agent.plan(STATES).value is None
     with pytest.raises(ValueError, match="baseline"):
         figures.value_field(plan, agent, axes)
 
@@ -88,7 +91,7 @@ def test_a_learner_without_values_has_no_value_field(plan, axes):
 @pytest.mark.parametrize("coding", ["onehot", "antecedent"])
 def test_usage_is_a_share(coding):
     agent = learner("q", coding=coding)
-    share = usage(agent, STATES[:5])
+    share = agent.usage(STATES[:5])
     assert share.shape == (60,)
     assert share.sum() == pytest.approx(1, abs=1e-5)
     if coding == "onehot":
@@ -127,7 +130,7 @@ def test_the_policy_bends_to_the_side_of_the_turn(plan, axes):
 
 def test_rule_map_shows_every_rule(plan, axes):
     agent = learner("q", coding="antecedent")
-    figures.rule_map(plan, agent, axes, usage(agent, STATES))
+    figures.rule_map(plan, agent, axes, agent.usage(STATES))
     dots = axes.collections[1]
     assert dots.get_offsets().data == pytest.approx(STATES[:, :2], abs=1e-6)
     assert len(set(dots.get_sizes())) > 1

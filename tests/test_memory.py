@@ -61,7 +61,7 @@ def test_every_decision_is_as_likely():
     assert len(counts) == 20 and stats.chisquare(counts.numpy()).pvalue > 0.001
 
 
-def test_a_restored_memory_goes_on_alike():
+def test_a_restored_memory_continues_alike():
     one, other = (ReplayMemory({"state": 2}, capacity=4) for _ in range(2))
     for i in range(6):
         one.add([i, -i])
@@ -88,21 +88,21 @@ def test_q_replay_is_the_bounded_sum_of_semi_gradients(coding, batch):
     before, length = net.consequents.numpy().copy(), net.n_outputs
     total, mass, best = np.zeros_like(before), np.zeros_like(before), []
     for i in batch:
-        features, (reward, goes_on), ahead = np.split(rows[i], [length, length + 2])
+        features, (reward, continues), ahead = np.split(rows[i], [length, length + 2])
         s = normalised(net, features[: net.n_inputs])
         values = []
         for code in agent.codes.numpy():
             f = np.concatenate([ahead, code, [1.0]])
             values.append(normalised(net, f[: net.n_inputs]) @ before @ f)
         best.append(max(values))
-        error = reward + 0.9 * goes_on * min(max(values), 0.1) - s @ before @ features
+        error = reward + 0.9 * continues * min(max(values), 0.1) - s @ before @ features
         total += error * np.outer(s, features)
         mass += np.outer(s, np.abs(features))
     assert min(best) < 0.1 < max(best)
     rate = np.array([0.1] * 3 + [0.2] * (length - 4) + [0.3])
     assert [reward for reward in rows[:3, length]] == REWARDS and rows[2, length + 1] == 0
     agent.rng = np.random.default_rng(0)
-    agent._replay()
+    agent._replay(agent.memory)
     np.testing.assert_allclose(
         net.consequents.numpy(), before + rate * total / np.maximum(mass, 1), rtol=1e-9, atol=1e-12
     )
@@ -127,13 +127,13 @@ def test_sga_replay_weighs_each_decision_by_its_likelihood(m, scaled, batch):
     before = net.consequents.numpy().copy()
     total, mass, ratios = np.zeros_like(before), np.zeros(net.n_rules), []
     for i in batch:
-        x, a, (then, reward, goes_on), ahead = np.split(rows[i], [3, 3 + m, 6 + m])
+        x, a, (then, reward, continues), ahead = np.split(rows[i], [3, 3 + m, 6 + m])
         s, out = normalised(net, x), normalised(net, x) @ before
         mu, sigma, value = out[:m], out[m : 2 * m], out[-1]
         now = (np.log(sigma) + 0.5 * ((a - mu) / sigma) ** 2).sum()
         ratios.append(math.exp(then - now))
         weight = min(1.0, ratios[-1])
-        error = reward + 0.9 * goes_on * (normalised(net, ahead) @ before[:, -1]) - value
+        error = reward + 0.9 * continues * (normalised(net, ahead) @ before[:, -1]) - value
         scale = sigma**2 if scaled else np.ones(m)
         by_mu = scale * (a - mu) / sigma**2
         by_sigma = scale * ((a - mu) ** 2 - sigma**2) / sigma**3
@@ -145,7 +145,7 @@ def test_sga_replay_weighs_each_decision_by_its_likelihood(m, scaled, batch):
     expected[:, :m] = expected[:, :m].clip(-1, 1)
     expected[:, m : 2 * m] = expected[:, m : 2 * m].clip(0.03, 9)
     agent.rng = np.random.default_rng(0)
-    agent._replay()
+    agent._replay(agent.memory)
     np.testing.assert_allclose(net.consequents.numpy(), expected, rtol=1e-9, atol=1e-12)
 
 

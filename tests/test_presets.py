@@ -9,7 +9,7 @@ from conftest import settings
 
 from sofnn_torch.runs.directory import flatten
 from sofnn_torch.runs.factory import make_agent
-from sofnn_torch.runs.presets import preset
+from sofnn_torch.runs.settings import Config
 
 # Section 5, as printed; a decay of 1 is equation 6, of 0 are equations 12-15.
 PRINTED = {
@@ -49,7 +49,6 @@ PRINTED = {
 # Where the paper is silent: docs/paper.md.
 READ = {
     "sga": {
-        "sga.actions": "three",
         "sga.baseline": "constant",
         "sga.constant": 0.0,
         "sga.variance_scaled": False,
@@ -58,9 +57,7 @@ READ = {
         "sga.replays": 0,
     },
     "q": {
-        "q.actions": "three",
         "q.coding": "antecedent",
-        "q.segments": 3,
         "q.trace_cut": False,
         "q.trace_limit": None,
         "q.value_limit": None,
@@ -74,6 +71,7 @@ READ = {
         "net.width_heading": 0.45,
         "net.grid_action": 8,
         "maze.dead_reckoning": "literal",
+        "maze.actions": "three",
     },
 }
 
@@ -82,14 +80,14 @@ READ = {
 @pytest.mark.parametrize("network", ["sofnn", "fixed"])
 @pytest.mark.parametrize("agent", ["sga", "q"])
 def test_the_preset_paper_has_the_numbers_of_the_paper(agent, network, numbers):
-    config = flatten(asdict(preset(agent, network, "paper")))
+    config = flatten(asdict(Config(agent=agent, network=network, preset="paper")))
     expected = numbers[agent] | numbers["both"]
     assert {name: config[name] for name in expected} == expected
 
 
 @pytest.mark.parametrize(("agent", "rules"), [("sga", 1152), ("q", 9216)])
 def test_the_fixed_networks_have_as_many_rules_as_in_the_paper(agent, rules):
-    assert make_agent(preset(agent, "fixed", "paper")).net.n_rules == rules
+    assert make_agent(Config(agent=agent, network="fixed", preset="paper")).net.n_rules == rules
 
 
 @pytest.mark.parametrize("seed", [0, 7])

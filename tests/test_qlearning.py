@@ -9,7 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from sofnn_torch.learners.qlearning import QConfig, QLearning, code_length
+from sofnn_torch.learners.learner import Task
+from sofnn_torch.learners.qlearning import QConfig, QLearning
+from sofnn_torch.maze.odometry import wheel_speeds
 from sofnn_torch.network.axes import Axis
 from sofnn_torch.network.sofnn import SOFNN
 
@@ -24,10 +26,13 @@ RATES = {
 }
 
 
-def learner(coding="onehot", rules=25, seed=0, segments=3, n_outputs=None, **settings):
+def learner(
+    coding="onehot", rules=25, seed=0, segments=3, n_outputs=None, actions="three", **settings
+):
     torch.manual_seed(seed)
     inputs = N + (coding == "antecedent")
-    outputs = n_outputs or N + code_length(coding, segments) + 1
+    length = {"scalar": 1, "wheels": 2, "onehot": segments, "antecedent": 1}[coding]
+    outputs = n_outputs or N + length + 1
     net = SOFNN(
         [Axis("x"), Axis("y"), Axis("heading", period=TAU), Axis("action")][:inputs],
         outputs,
@@ -41,7 +46,9 @@ def learner(coding="onehot", rules=25, seed=0, segments=3, n_outputs=None, **set
         centre[2] *= math.pi
         net.add_rule(centre, 0.2 + torch.rand(inputs).double(), torch.randn(outputs).double())
     settings = {"value_limit": None, "replays": 0} | settings
-    return QLearning(net, N, QConfig(coding=coding, segments=segments, **settings), seed)
+    names = ("right", "straight", "left") if actions == "three" else ("steer",)
+    task = Task(net.axes[:N], names, actions == "three", wheel_speeds)
+    return QLearning(net, task, QConfig(coding=coding, segments=segments, **settings), seed)
 
 
 def closed_form(net, x, features):
@@ -60,9 +67,7 @@ def closed_form(net, x, features):
 
 def chosen(agent, command, x):
     """Features (x, a, 1) and network input of the action that was taken, from the command."""
-    scalar = (
-        agent.representatives[command] if agent.config.actions == "three" else float(command[0])
-    )
+    scalar = agent.representatives[command] if agent.task.discrete else float(command[0])
     if agent.coding == "onehot":
         code = [float(j == command) for j in range(agent.segments)]
     elif agent.coding == "wheels":
@@ -271,7 +276,7 @@ def test_a_grown_learner_restores_bit_for_bit(coding):
     ("settings", "message"),
     [
         ({"n_outputs": 5}, "outputs"),
-        ({"segments": 4}, "3 segments"),
+        ({"coding": "onehot", "segments": 4}, "needs a network with 3 inputs and 7 outputs"),
         ({"temperature": 0.0}, "temperature"),
     ],
 )

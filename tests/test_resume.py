@@ -27,7 +27,8 @@ CASES = GROWING | {
         pose="odometry",
         trials=6,
         net={"growth": "input", "theta": 0.7},
-        sga={"actions": "wheels", "rate_centre": 0.01, "rate_width": 0.01},
+        sga={"rate_centre": 0.01, "rate_width": 0.01},
+        maze={"actions": "wheels"},
     ),
     "q-antecedent": settings(
         "q", trials=6, q={"coding": "antecedent", "rate_centre": 1e-4, "rate_width": 1e-4}

@@ -31,15 +31,15 @@ SHORT = {"max_steps": 80}
 ADAPT = {"rate_centre": 0.001, "rate_width": 0.001}  # numbers with all their digits
 VARIANTS = {
     "three": settings("sga", sga=ADAPT),
-    "steer": settings("sga", sga={"actions": "steer"}),
-    "wheels": settings("sga", sga={"actions": "wheels"}),
+    "steer": settings("sga", maze={"actions": "steer"}),
+    "wheels": settings("sga", maze={"actions": "wheels"}),
     "constant": settings("sga", sga={"baseline": "constant", "replays": 0}, pose="true"),
     "shared": settings("sga", net={"growth": "input"}),
     "grid": settings("sga", "fixed"),
     "q-onehot": settings("q", q=ADAPT),
     "q-wheels": settings("q", q={"coding": "wheels", "rate_state": 0.1}),
     "q-scalar": settings("q", q={"coding": "scalar", "rate_constant": 0.1}),
-    "q-segments": settings("q", q={"actions": "steer", "segments": 7}),
+    "q-segments": settings("q", maze={"actions": "steer"}, q={"segments": 7}),
     "q-antecedent": settings("q", q={"coding": "antecedent", "rate_constant": 0.1}),
     "q-grid": settings("q", "fixed"),
 }
@@ -218,7 +218,7 @@ def test_rules_may_be_changed_dropped_and_added(run, tmp_path, call, mean, actio
     assert np.array_equal(parameters(after)[:-1], parameters(before)[1:])
     assert after.act(np.float32([0.9, 0.9, 3.0])) == action  # no other rule is near
     assert (
-        f"action: {words.TURNS[action]}"
+        f"action: {after.choices[action]}"
         in call(run.with_name("run-edited"), "--at", 0.9, 0.9, math.degrees(3.0))[1]
     )
 
@@ -344,7 +344,7 @@ def test_the_values_of_q_learning():
     learner = small((0.0, 1, 0, 3, 1, 2, 0.5), (0.0, 0, 0, 0, 0, 0, 65), agent="q", at=at)
     said = words.read(learner).consequents
     assert said[""] == ["right turn", "undecided"]
-    assert [said[f"Q {name}"][0] for name in words.TURNS] == ["3.75", "1.75", "2.75"]
+    assert [said[f"Q {name}"][0] for name in learner.choices] == ["3.75", "1.75", "2.75"]
 
 
 def test_an_action_among_the_antecedents():
@@ -376,13 +376,15 @@ def test_the_rules_at_a_state_add_up_to_what_the_learner_says(trained, variant):
             if config.agent == "sga":
                 expected, chosen = agent.net(x[None])[0], None
             else:
-                expected = agent.action_values(x, agent.net.normalised_firing(agent.inputs(x)))
+                expected = agent.action_values(
+                    x, agent.net.normalised_firing(agent.network_inputs(x))
+                )
                 chosen = agent.representatives[int(expected.argmax())]
         assert decision.outputs == pytest.approx(expected.numpy(), rel=1e-4, abs=1e-5)
         assert decision.shares.sum(0) == pytest.approx(1.0, abs=1e-5)
         action = agent.act(state)
-        if agent.config.actions == "three":
-            assert decision.action == words.TURNS[action]
+        if agent.task.discrete:
+            assert decision.action == agent.choices[action]
         else:
             assert f"{action[-1]:.2f}".replace("-0.00", "0.00") in decision.action
             assert chosen is None or f"{chosen:.2f}" in decision.action
@@ -478,8 +480,8 @@ def test_files_are_the_same_every_time(run, tmp_path, call):
         (["RUN", "--top", "-1"], "--top must not be negative"),
         (["RUN", "--seed", "-1"], "--seed must not be negative"),
         (["RUN", "--at", "0.1", "0.1"], "--at must be FLOAT FLOAT FLOAT or None, got ['0.1', '"),
-        (["RUN", "--at", "0.1", "nan", "0"], "--at needs three finite numbers"),
-        (["RUN", "--at", "inf", "0.1", "0"], "--at needs three finite numbers"),
+        (["RUN", "--at", "0.1", "nan", "0"], "--at must be a finite number"),
+        (["RUN", "--at", "inf", "0.1", "0"], "--at must be a finite number"),
         (["RUN", "--json", "rules.csv"], "--json must end in .json"),
         (["RUN", "--csv", "rules"], "--csv must end in .csv"),
         (["RUN", "--picture", "rules.gif"], "--picture must end in .png or .svg or .pdf"),

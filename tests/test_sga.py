@@ -1,6 +1,5 @@
 """SGA against the closed forms of its gradients and hand-computed updates (eqs 4-8)."""
 
-import dataclasses
 import math
 
 import numpy as np
@@ -9,7 +8,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sofnn_torch.learners.sga import LEFT, RIGHT, SGA, STRAIGHT, SGAConfig, log_likelihood
+from sofnn_torch.learners.learner import Task
+from sofnn_torch.learners.sga import SGA, SGAConfig, negative_log_likelihood
+from sofnn_torch.maze.env import LEFT, RIGHT, STRAIGHT
 from sofnn_torch.network.axes import Axis
 from sofnn_torch.network.sofnn import SOFNN
 
@@ -17,7 +18,7 @@ N, TAU = 3, 2 * math.pi
 ADAPTIVE = {"rate_centre": 1e-3, "rate_width": 1e-3, "rate_mean": 0.05, "rate_deviation": 1e-3}
 
 
-def learner(m=1, rules=30, seed=0, baseline="value", n_outputs=None, **settings):
+def learner(m=1, rules=30, seed=0, baseline="value", n_outputs=None, discrete=0, **settings):
     torch.manual_seed(seed)
     learned = int(baseline == "value")
     net = SOFNN(
@@ -34,9 +35,10 @@ def learner(m=1, rules=30, seed=0, baseline="value", n_outputs=None, **settings)
         centre, width = torch.rand(N) * 2 - 1, 0.2 + torch.rand(N)
         centre[2] *= math.pi
         net.add_rule(centre.double(), width.double(), consequents.double())
-    actions = "wheels" if m == 2 else "steer"
+    names = tuple("abcdef"[: discrete or m])
+    task = Task(net.axes, names, discrete=discrete > 0)
     settings = {"sigma_min": 0.03, "value_limit": None, "replays": 0} | settings
-    return SGA(net, SGAConfig(actions=actions, baseline=baseline, **settings), seed)
+    return SGA(net, task, SGAConfig(baseline=baseline, **settings), seed)
 
 
 def closed_form(net, x, action, m):
@@ -206,7 +208,7 @@ def test_a_trial_that_is_cut_off_ends_with_what_its_last_state_is_worth():
 
 
 def test_sigma_and_mu_stay_in_bounds():
-    agent = learner(rate_mean=1e4, rate_deviation=1e4, sigma_min=0.05, sigma_max=0.7)
+    agent = learner(rate_mean=500, rate_deviation=500, sigma_min=0.05, sigma_max=0.7)
     x = np.array([0.1, 0.2, 0.3])
     agent.start(x)
     for k in range(50):
@@ -227,20 +229,31 @@ def test_sampled_actions_have_the_moments_of_equation_5():
     assert agent.act(x)[0] == pytest.approx(0.1)
 
 
-def test_log_likelihood_is_the_normal_density():
+def test_the_negative_log_likelihood_is_that_of_the_normal_density():
     a, mu, sigma = torch.tensor([0.3, -1.0]), torch.tensor([0.1, 0.0]), torch.tensor([0.5, 2.0])
     expected = torch.distributions.Normal(mu, sigma).log_prob(a)
-    torch.testing.assert_close(log_likelihood(a, mu, sigma), expected)
+    constant = 0.5 * math.log(2 * math.pi)
+    torch.testing.assert_close(-negative_log_likelihood(a, mu, sigma) - constant, expected)
 
 
 @pytest.mark.parametrize(
     ("mean", "command"), [(-0.334, RIGHT), (-0.333, STRAIGHT), (0.333, STRAIGHT), (0.334, LEFT)]
 )
 def test_the_scalar_is_cut_into_three_actions(mean, command):
-    agent = learner(rules=1)
-    agent.config = dataclasses.replace(agent.config, actions="three")
+    agent = learner(rules=1, discrete=3)
     agent.net.blocks[0].data[-3, 0] = mean
     assert agent.act(np.zeros(3)) == command
+    assert agent.plan(np.zeros((1, 3))).choice.tolist() == [command]
+
+
+@pytest.mark.parametrize("count", [2, 4, 5])
+def test_any_number_of_discrete_actions_are_equal_parts_of_the_range(count):
+    agent = learner(rules=1, discrete=count)
+    for mean in np.linspace(-0.985, 0.985, 40):
+        agent.net.blocks[0].data[-3, 0] = mean
+        expected = min(int((mean + 1) / 2 * count), count - 1)
+        assert agent.act(np.zeros(3)) == expected
+        assert agent.plan(np.zeros((1, 3))).choice.tolist() == [expected]
 
 
 def test_acting_changes_nothing_and_adds_no_rule():
@@ -268,5 +281,5 @@ def test_a_restored_learner_continues_bit_for_bit():
 def test_wrong_networks_and_bounds_are_refused():
     with pytest.raises(ValueError, match="outputs"):
         learner(n_outputs=5, rules=0)
-    with pytest.raises(ValueError, match="sigma_min"):
+    with pytest.raises(ValueError, match="sigma-min"):
         learner(sigma_min=0.5, sigma_max=0.1)

@@ -19,7 +19,7 @@ from sofnn_torch.pictures.events import EventFile
 from sofnn_torch.pictures.film import film, gif
 from sofnn_torch.pictures.tensorboard import Monitor
 from sofnn_torch.runs.factory import make_agent, make_env
-from sofnn_torch.runs.presets import preset
+from sofnn_torch.runs.settings import Config
 from sofnn_torch.runs.trial import Trajectory
 from sofnn_torch.training import play
 
@@ -27,7 +27,7 @@ METRICS = Path(__file__).parents[1] / "docs" / "metrics.md"
 
 
 def settings(kind="sga", **maze):
-    config = preset(kind, "sofnn", "default")
+    config = Config(agent=kind, network="sofnn")
     return replace(config, maze=replace(config.maze, **{"max_steps": 150, **maze}))
 
 

@@ -4,7 +4,7 @@ from collections import Counter
 
 import numpy as np
 
-from sofnn_torch.runs.factory import Agent
+from sofnn_torch.learners.learner import Learner
 
 PATIENCE = 4  # decisions at a rule that a sound way may need: a turn, a coarse grid
 MOST = 10  # doublings: by then every action is about as likely
@@ -25,7 +25,7 @@ class FrozenPolicy:
         explore: begin with the learned stochastic policy instead of the mean or greedy action.
     """
 
-    def __init__(self, agent: Agent, explore: bool = False):
+    def __init__(self, agent: Learner, explore: bool = False):
         self.agent, self.explore = agent, explore
         self.visits: Counter[int] = Counter()
 

@@ -16,159 +16,140 @@ consequents; as usual the target is held constant (semi-gradient).
 import math
 from dataclasses import dataclass
 from itertools import accumulate, pairwise
-from typing import Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
+from sofnn_torch.bounds import Count, NotNegative, Positive, Settings, Share, Within
+from sofnn_torch.learners.learner import Action, Layout, Learner, Output, Task, column
 from sofnn_torch.learners.memory import ReplayMemory
+from sofnn_torch.network.axes import Axis
 from sofnn_torch.network.sofnn import SOFNN
 
-Coding = Literal["scalar", "wheels", "onehot", "antecedent"]
-TURN = 0.4  # wheel speed of a turn over that of going straight: 4 mm/s of 10 mm/s
+ACTION = Axis("action", "", -1.0, 1.0)
 
 
 @dataclass(frozen=True)
-class QConfig:
+class QConfig(Settings, table="q"):
     """Section 4: Q-learning."""
 
-    actions: Literal["three", "steer"] = "three"
-    """`three`: right turn, straight, left turn; `steer`: one continuous action in J segments."""
-    coding: Coding = "onehot"
+    coding: Literal["scalar", "wheels", "onehot", "antecedent"] = "onehot"
     """Action vector of eq. 9: `scalar`, `wheels` (wheel speeds), `onehot`, or `antecedent` (the
     action also enters the rules' antecedents: the paper's fuzzy net - a)."""
-    segments: int = 3
-    """Number J of segments of the action range."""
-    temperature: float = 0.05
+    segments: Annotated[int, Within(above=0), Within(most=1_000)] = 3
+    """Number J of segments of a continuous range; of discrete actions J is their number."""
+    temperature: Positive = 0.05
     """Temperature T of the Boltzmann roulette, eq. 11."""
-    gamma: float = 0.99
+    gamma: Share = 0.99
     """Discount per decision."""
-    trace_decay: float = 0.8
+    trace_decay: Share = 0.8
     """Lambda of the eligibility traces; 0 in the paper."""
     trace_cut: bool = True
     """Clear the traces at an action that is not greedy (Watkins)."""
-    trace_limit: float | None = 1.0
+    trace_limit: Positive | None = 1.0
     """Bound of the consequents' traces; None for no bound."""
     value_limit: float | None = 100.0
-    """Bound of the value of the following state in the TD error, the goal's reward; None for no
+    """Bound of the value of the next state in the TD error, the goal's reward; None for no
     bound."""
-    rate_state: float = 0.0
+    rate_state: NotNegative = 0.0
     """Learning rate of c_x."""
-    rate_action: float = 1.0
+    rate_action: NotNegative = 1.0
     """Learning rate of c_a."""
-    rate_constant: float = 0.0
+    rate_constant: NotNegative = 0.0
     """Learning rate of c."""
-    rate_centre: float = 0.0
+    rate_centre: NotNegative = 0.0
     """Learning rate of the centres u; 0 leaves them where they were put."""
-    rate_width: float = 0.0
+    rate_width: NotNegative = 0.0
     """Learning rate of the widths v; 0 leaves them as they are."""
     initial: float = 65.0
     """Initial c of a rule, the value of an unknown state; optimistic at the start of the maze."""
-    replays: int = 100
+    replays: Annotated[int, Within(least=0)] = 100
     """Batches of remembered decisions to learn from again at the beginning of each trial; 0 for
     none."""
-    memory: int = 20_000
+    memory: Annotated[Count, Within(most=10_000_000)] = 20_000
     """Decisions that are remembered."""
 
+    def idle(self) -> dict[str, str]:
+        """Settings that change nothing beside the others, and why."""
+        return {} if self.replays else {"memory": "with --q.replays 0"}
 
-def code_length(coding: Coding, segments: int) -> int:
-    """Length of the action vector in equation 9."""
-    return {"scalar": 1, "wheels": 2, "onehot": segments, "antecedent": 1}[coding]
 
-
-class QLearning:
+class QLearning(Learner):
     """The learner of section 4. Rows of the consequents: c_x (n), c_a, c (1).
 
     Args:
         net: network over the state, or over state and action with the coding ``antecedent``.
-        n_states: length n of the state.
-        config: the settings; their initial value is that of the network.
+        task: what is learned; a vector of actions may have one number.
+        settings: of the learner; their initial value is that of the network.
         seed: seed of the roulette and of the action inside a segment.
 
     Raises:
-        ValueError: the network has another number of inputs or outputs, or a setting is out of
-            range.
+        ValueError: the network has another number of inputs or outputs, or the settings do not go
+            with the task.
+
+    Example:
+        >>> from sofnn_torch.network.axes import named
+        >>> task = Task(named(2), ("left", "right"), discrete=True)
+        >>> agent = QLearning(SOFNN(2, 5, width=0.2), task, QConfig())
+        >>> agent.start(np.array([0.1, 0.2])) in (0, 1)
+        True
     """
 
-    def __init__(self, net: SOFNN, n_states: int, config: QConfig, seed: int = 0):
-        coding, segments = config.coding, config.segments
-        length = code_length(coding, segments)
-        inputs = n_states + (coding == "antecedent")
-        if (net.n_inputs, net.n_outputs) != (inputs, n_states + length + 1):
-            raise ValueError(
-                f"coding {coding} needs {inputs} inputs and {n_states + length + 1} outputs, "
-                f"the network has {net.n_inputs} and {net.n_outputs}"
-            )
-        if config.actions == "three" and segments != 3:
-            raise ValueError(f"the three actions need 3 segments, got {segments}")
-        if not config.temperature > 0:
-            raise ValueError(f"the temperature must be positive, got {config.temperature}")
-        self.net, self.n, self.config = net, n_states, config
-        self.coding, self.segments = coding, segments
-        self.gamma, self.decay = config.gamma, config.gamma * config.trace_decay
-        self.value_limit = math.inf if config.value_limit is None else config.value_limit
-        self.rng = np.random.default_rng(seed)
-        self.antecedents = config.rate_centre > 0 or config.rate_width > 0
-        rates = [config.rate_state] * n_states + [config.rate_action] * length
-        rates += [config.rate_constant]
+    name = "q"
+    Settings = QConfig
+
+    def __init__(self, net: SOFNN, task: Task, settings: QConfig, seed: int = 0):
+        super().__init__(net, task, settings, seed)
+        self.n, self.coding = len(task.axes), settings.coding
+        self.segments = segments = len(task.actions) if task.discrete else settings.segments
+        self.gamma, self.decay = settings.gamma, settings.gamma * settings.trace_decay
+        self.value_limit = math.inf if settings.value_limit is None else settings.value_limit
+        self.antecedents = settings.rate_centre > 0 or settings.rate_width > 0
+        length = net.n_outputs - self.n - 1  # of the action vector
+        rates = [settings.rate_state] * self.n + [settings.rate_action] * length
+        rates += [settings.rate_constant]
         if self.antecedents:
             n = net.n_inputs
-            rates = [config.rate_centre] * n + [config.rate_width] * n + rates
-        self.rates = net.default_width.new_tensor(rates)[:, None]
+            rates = [settings.rate_centre] * n + [settings.rate_width] * n + rates
+        self.rates = column(net, rates)
         self.replay_rates = self.rates[-net.n_outputs :]
-        if config.replays:
-            fields = {"features": net.n_outputs, "reward": 0, "goes_on": 0, "following": n_states}
-            dtype = net.default_width.cpu().numpy().dtype
-            self.memory = ReplayMemory(fields, config.memory, dtype)
-        self.features: list[float] = []  # (x, a, 1) of the last decision
         ends = [-1 + 2 * j / segments for j in range(segments + 1)]
         self.edges = list(pairwise(ends))
         middles = [(low + high) / 2 for low, high in self.edges]
-        # The three actions are the ends and the middle of the steering range themselves.
-        self.representatives = [-1.0, 0.0, 1.0] if config.actions == "three" else middles
+        # Discrete actions begin and end at the ends of the range themselves.
+        spread = [2 * j / max(segments - 1, 1) - 1.0 for j in range(segments)]
+        self.representatives = spread if task.discrete else middles
+        self.choices = self.choices or tuple(f"{a:+.2f}" for a in middles)
         codes = [self._code(j, a) for j, a in enumerate(self.representatives)]
         self.codes = self.rates.new_tensor(codes)  # (J, length)
         self.tails = torch.cat([self.codes, self.codes.new_ones(segments, 1)], 1)
-        self.value = 0.0
-        self._log = {"value": [], "error": [], "greedy": [], "firing": []}
+        if settings.replays:
+            self._remember({"features": net.n_outputs}, settings.memory)
 
-    def start(self, observation: np.ndarray) -> int | np.ndarray:
-        """Begin a trial at the observation (n,): clear the traces, choose the first action."""
-        self.net.traces.zero_()
-        if self.config.replays and len(self.memory):
-            self._replay()
-        x = self._tensor(observation)
-        return self._choose(x, self._firing(x))
+    @classmethod
+    def layout(cls, settings: QConfig, task: Task) -> Layout:
+        """The state, for ``antecedent`` the action too; c_x, c_a and c of equation 9."""
+        if not task.discrete and len(task.actions) != 1:
+            raise ValueError(
+                "Q-learning chooses among discrete actions or on one axis, "
+                f"not {len(task.actions)} at once: use SGA"
+            )
+        if settings.coding == "wheels" and task.wheels is None:
+            raise ValueError("--q.coding wheels is for a robot with two wheels")
+        segments = [f"segment {j + 1}" for j in range(settings.segments)]
+        actions = {
+            "onehot": list(task.actions) if task.discrete else segments,
+            "wheels": ["wheel left", "wheel right"],
+        }.get(settings.coding, ["action"])
+        names = [f"c {name}" for name in [*(axis.name for axis in task.axes), *actions]]
+        outputs = [*map(Output, names), Output("c", settings.initial)]
+        acting = settings.coding == "antecedent"
+        return (*task.axes, *[ACTION] * acting), tuple(outputs)
 
-    def step(
-        self, reward: float, observation: np.ndarray, terminated: bool, truncated: bool = False
-    ) -> int | np.ndarray | None:
-        """Learn from the reward of the last action, then choose the next (None at the end).
-
-        Args:
-            reward: reward of the last action.
-            observation: the state that it led to. Shape: (n,).
-            terminated: no state follows this one; its value is 0.
-            truncated: the trial ends here, but not the robot's way: the value of the state counts.
-        """
-        if self.config.replays:
-            self.memory.add([*self.features, reward, not terminated, *observation.tolist()])
-        if terminated:
-            self._learn(reward - self.value)
-            return None
-        x = self._tensor(observation)
-        firing = self._firing(x)
-        following = min(max(self.action_values(x, firing).tolist()), self.value_limit)
-        self._learn(reward + self.gamma * following - self.value)
-        if truncated:
-            return None
-        if self.antecedents:  # they have moved
-            with torch.no_grad():
-                firing = self.net.normalised_firing(self.inputs(x))
-        return self._choose(x, firing)
-
-    def act(self, observation: np.ndarray, explore: float = 0) -> int | np.ndarray:
+    def act(self, observation: NDArray[Any], explore: float = 0) -> Action:
         """The greedy action, or one by roulette; learns nothing and adds no rule.
 
         Args:
@@ -178,51 +159,40 @@ class QLearning:
         """
         x = self._tensor(observation)
         with torch.no_grad():
-            values = self.action_values(x, self.net.normalised_firing(self.inputs(x)))
+            values = self.action_values(x, self.net.normalised_firing(self.network_inputs(x)))
         if explore:
             return self._command(*self._draw(values.tolist(), explore))
         segment = int(values.argmax())
         return self._command(segment, self.representatives[segment])
 
-    def strongest_rule(self, observation: np.ndarray) -> int:
-        """The rule that fires most at the state (n,)."""
-        with torch.no_grad():
-            firing = self.net.normalised_firing(self.inputs(self._tensor(observation)))
-        return int(firing.argmax()) % self.net.n_rules
+    def conclusions(self, x: Tensor) -> tuple[list[str], NDArray[np.float64]]:
+        """The value that each rule gives to each action (eq. 9): names (J,) and numbers (K, J).
 
-    def statistics(self) -> dict[str, float]:
-        """Means over the decisions since the last call (docs/metrics.md); starts afresh."""
-        log, self._log = self._log, {name: [] for name in self._log}
-        if not log["value"]:
-            return {}
-        value, error = torch.tensor(log["value"]), torch.tensor(log["error"] or [0.0])
-        return {
-            "policy/value_mean": value.mean().item(),
-            "policy/value_max": value.max().item(),
-            "policy/greedy_share": sum(log["greedy"]) / len(log["greedy"]),
-            "learning/error_rms": error.square().mean().sqrt().item(),
-        } | self.net.statistics(log["firing"])
+        Args:
+            x: where, one state for all rules or the inputs of one each. Inputs with an action have
+                but one value, of that action. Shape: (n,), (K, n) or (K, n + 1).
+        """
+        consequents, n = self.net.consequents.double(), self.n
+        if x.shape[-1] > n:
+            features = torch.cat([x, x.new_ones(len(x), 1)], 1)
+            return ["Q"], (self.net.consequents * features).sum(1, keepdim=True).double().numpy()
+        of_state = (consequents[:, :n] * x).sum(1, keepdim=True)
+        values = of_state + consequents[:, n:] @ self.tails.double().T
+        return [f"Q {name}" for name in self.choices], values.numpy()
 
-    def state_dict(self) -> dict:
-        """Everything that the future depends on, as tensors, numbers and text."""
-        rng = self.rng.bit_generator.state
-        state = {"net": self.net.state_dict(), "rng": rng, "value": self.value}
-        return state | ({"memory": self.memory.state_dict()} if self.config.replays else {})
-
-    def load_state_dict(self, state: dict) -> None:
-        """Counterpart of `state_dict`; a fresh learner takes the size of the stored network."""
-        self.net.load_state_dict(state["net"])
-        self.rng.bit_generator.state = state["rng"]
-        self.value = state["value"]
-        if self.config.replays:
-            self.memory.load_state_dict(state["memory"])
+    def alone(self, conclusions: NDArray[np.float64]) -> NDArray[np.int64] | None:
+        """The action to which each rule gives the greatest value; -1 where several. Shape: (K,)."""
+        if conclusions.shape[1] != self.segments:
+            return None
+        best = conclusions == conclusions.max(1, keepdims=True)
+        return np.where(best.sum(1) > 1, -1, best.argmax(1))
 
     def action_values(self, x: Tensor, firing: Tensor) -> Tensor:
         """Q(x, a_j) of every segment (eq. 10).
 
         Args:
             x: state, or many. Shape: (n,) or (B, n).
-            firing: normalised firing at ``inputs(x)``.
+            firing: normalised firing at ``network_inputs(x)``.
 
         Returns:
             Shape: (J,) or (B, J).
@@ -233,32 +203,42 @@ class QLearning:
         features = torch.cat(self._beside(x, self.tails), -1)
         return (features * conclusions).sum(-1)
 
-    def inputs(self, x: Tensor) -> Tensor:
-        """Network inputs at states (.., n): the same, or with every action (.., J, n + 1)."""
+    def network_inputs(self, x: Tensor) -> Tensor:
+        """Inputs of the network at states (.., n): these, or with every action (.., J, n + 1)."""
         if self.coding != "antecedent":
             return x
         return torch.cat(self._beside(x, self.codes), -1)
+
+    def _policy(self, x: Tensor) -> tuple[Tensor, Tensor | None]:
+        inputs = self.network_inputs(x)
+        firing = self.net.normalised_firing(inputs.reshape(-1, inputs.shape[-1]))
+        values = self.action_values(x, firing.reshape(*inputs.shape[:-1], -1))
+        value, best = values.max(1)
+        return best, value
 
     def _firing(self, x: Tensor) -> Tensor:
         """Normalised firing at x: (K,), or (J, K) if the action is an antecedent."""
         if self.coding != "antecedent":
             return self.net.observe(x)
-        inputs = self.inputs(x)
+        inputs = self.network_inputs(x)
         if self.net.n_rules == 0:
             self.net.grow(inputs[self.segments // 2])
         with torch.no_grad():
             return self.net.normalised_firing(inputs)
 
-    def _choose(self, x: Tensor, firing: Tensor) -> int | np.ndarray:
+    def _choose(self, x: Tensor, firing: Tensor) -> Action:
         """Draw an action (eq. 11) and add the gradient of its value to the traces."""
         net = self.net
+        if self.antecedents:  # they may have moved since the firing was computed
+            with torch.no_grad():
+                firing = net.normalised_firing(self.network_inputs(x))
         values = self.action_values(x, firing).tolist()
         segment, inside = self._draw(values)
-        scalar = self.representatives[segment] if self.config.actions == "three" else inside
+        scalar = self.representatives[segment] if self.task.discrete else inside
         # The paper draws the action inside the segment also where the robot only has three.
         code = self._code(segment, inside if self.coding == "scalar" else scalar)
-        self.features = [*x.tolist(), *code, 1.0]
-        features = x.new_tensor(self.features)
+        self.decision = [*x.tolist(), *code, 1.0]
+        features = x.new_tensor(self.decision)
         if self.coding == "antecedent":
             x = features[: self.n + 1]
             firing = net.observe(x)
@@ -269,37 +249,44 @@ class QLearning:
         outputs = consequents @ firing
         self.value = (features @ outputs.detach()).item()
         greedy = values[segment] == max(values)
-        decay = self.decay if greedy or not self.config.trace_cut else 0.0
+        decay = self.decay if greedy or not self.settings.trace_cut else 0.0
         gradient = torch.autograd.grad(outputs, parameters, features)[0]  # of features . outputs
-        net.accumulate(gradient, decay, self.config.trace_limit)
+        net.accumulate(gradient, decay, self.settings.trace_limit)
         self._log["value"].append(self.value)
         self._log["greedy"].append(greedy)
         self._log["firing"].append(net.max_firing)
         return self._command(segment, scalar)
+
+    def _error(self, reward: float, x: Tensor | None = None, firing: Tensor | None = None) -> float:
+        """The temporal-difference error (eqs 12, 13)."""
+        if x is None or firing is None:
+            return reward - self.value
+        ahead = min(max(self.action_values(x, firing).tolist()), self.value_limit)
+        return reward + self.gamma * ahead - self.value
 
     def _learn(self, error: float) -> None:
         """Equations 14 and 15 for the temporal-difference error."""
         self._log["error"].append(error)
         self.net.adapt(self.rates, error)
 
-    def _replay(self) -> None:
+    def _replay(self, memory: ReplayMemory) -> None:
         """Equations 12-15 for batches of remembered decisions; the antecedents stay."""
         net, (features_of, firing_at) = self.net, self.net.firing_functions()
-        seen = self.memory.sample(self.config.replays, self.rng, self.rates)
-        here = features_of(seen["features"][..., : net.n_inputs])
-        there = features_of(self.inputs(seen["following"]))
-        for x, ahead, *row in zip(here, there, *seen.values(), strict=True):
-            features, reward, goes_on, following = row
-            best = self.action_values(following, firing_at(ahead)).amax(-1)
+        seen = memory.sample(self.settings.replays, self.rng, self.rates)
+        states = features_of(seen["features"][..., : net.n_inputs])
+        next_states = features_of(self.network_inputs(seen["next_state"]))
+        for x, next_x, *row in zip(states, next_states, *seen.values(), strict=True):
+            features, reward, continues, next_state = row
+            best = self.action_values(next_state, firing_at(next_x)).amax(-1)
             firing, consequents = firing_at(x), net.learnable(antecedents=False)
             value = (features.T * (consequents @ firing.T)).sum(0)
-            target = reward + self.gamma * goes_on * best.clamp_(max=self.value_limit)
+            target = reward + self.gamma * continues * best.clamp_(max=self.value_limit)
             (gradient,) = torch.autograd.grad(value, consequents, target - value.detach())
             net.adapt_batch(self.replay_rates, gradient, features.T.abs() @ firing)
 
     def _roulette(self, values: list[float], hotter: float = 1) -> int:
         """A segment drawn with the probabilities of equation 11."""
-        best, temperature = max(values), self.config.temperature * hotter
+        best, temperature = max(values), self.settings.temperature * hotter
         wheel = list(accumulate(math.exp((v - best) / temperature) for v in values))
         ball = self.rng.random() * wheel[-1]
         return next(j for j, edge in enumerate(wheel) if ball < edge)
@@ -314,9 +301,8 @@ class QLearning:
         """The action vector a of equation 9."""
         if self.coding == "onehot":
             return [float(j == segment) for j in range(self.segments)]
-        if self.coding == "wheels":
-            forward, turn = 1 - abs(scalar), TURN * scalar
-            return [forward - turn, forward + turn]
+        if self.coding == "wheels" and self.task.wheels:
+            return self.task.wheels(scalar)
         return [scalar]
 
     def _beside(self, x: Tensor, codes: Tensor) -> tuple[Tensor, Tensor]:
@@ -324,8 +310,18 @@ class QLearning:
         shape = (*x.shape[:-1], self.segments, -1)
         return x.unsqueeze(-2).expand(shape), codes.expand(shape)
 
-    def _tensor(self, observation: np.ndarray) -> Tensor:
-        return torch.from_numpy(observation).to(self.rates)
+    def _summary(self, log: dict[str, list[float]]) -> dict[str, float]:
+        value = torch.tensor(log["value"])
+        return {
+            "policy/value_mean": value.mean().item(),
+            "policy/value_max": value.max().item(),
+            "policy/greedy_share": sum(log["greedy"]) / len(log["greedy"]),
+        }
 
-    def _command(self, segment: int, scalar: float) -> int | np.ndarray:
-        return segment if self.config.actions == "three" else np.array([scalar], np.float32)
+    def _command(self, segment: int, scalar: float) -> Action:
+        return segment if self.task.discrete else np.array([scalar], np.float32)
+
+    def _commands(self, found: NDArray[Any]) -> NDArray[Any]:
+        if self.task.discrete:
+            return found
+        return np.array(self.representatives, np.float32)[found, None]

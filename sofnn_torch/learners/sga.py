@@ -13,46 +13,47 @@ constant, as in the paper, or the change of a value V learned on the same rules 
 (Kimura & Kobayashi, ICML 1998): b = V(x_t) - gamma V(x_t+1) makes r - b the TD error.
 """
 
+import bisect
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
+from sofnn_torch.bounds import Count, NotNegative, Positive, Settings, Share, Within
+from sofnn_torch.learners.learner import Action, Layout, Learner, Output, Task, column
 from sofnn_torch.learners.memory import ReplayMemory
 from sofnn_torch.network.sofnn import SOFNN
 
-Actions = Literal["three", "steer", "wheels"]
-RIGHT, STRAIGHT, LEFT = 0, 1, 2
+# Bounds of mu and sigma would hide a rate that makes a typical step longer than their range.
+PolicyRate = Annotated[NotNegative, Within(most=500)]
 
 
 @dataclass(frozen=True)
-class SGAConfig:
+class SGAConfig(Settings, table="sga"):
     """Section 3: stochastic gradient ascent."""
 
-    actions: Actions = "three"
-    """`three`: right turn, straight, left turn; `steer`: one continuous action that blends them;
-    `wheels`: two wheel speeds."""
-    gamma: float = 0.99
+    gamma: Share = 0.99
     """Discount per decision."""
-    trace_decay: float = 0.8
+    trace_decay: Share = 0.8
     """Lambda of the eligibility traces; 1 in the paper."""
     baseline: Literal["constant", "value"] = "value"
     """Reinforcement baseline b of eq. 7: the paper's constant, or a value learned by TD."""
     constant: float = 0.0
     """The constant baseline."""
-    rate_mean: float = 30.0
+    rate_mean: PolicyRate = 30.0
     """Learning rate of the consequents mu."""
-    rate_deviation: float = 10.0
+    rate_deviation: PolicyRate = 10.0
     """Learning rate of the consequents sigma."""
-    rate_centre: float = 0.0
+    rate_centre: NotNegative = 0.0
     """Learning rate of the centres u; 0 leaves them where they were put."""
-    rate_width: float = 0.0
+    rate_width: NotNegative = 0.0
     """Learning rate of the widths v; 0 leaves them as they are."""
-    rate_value: float = 1.0
+    rate_value: NotNegative = 1.0
     """Learning rate of the value consequents (baseline `value`)."""
     one_minus_gamma: bool = False
     """Multiply the policy's learning rates by (1 - gamma), as eq. 8 prints."""
@@ -60,123 +61,111 @@ class SGAConfig:
     """Multiply eligibilities by sigma squared, which keeps steps bounded as sigma shrinks."""
     initial_value: float = 0.65
     """Value of an unknown state (baseline `value`); optimistic at the start of the maze."""
-    sigma_initial: float = 0.3
+    sigma_initial: Positive = 0.3
     """Standard deviation of the first rule, and of new rules without interpolation."""
-    sigma_min: float = 0.1
+    sigma_min: Positive = 0.1
     """Lower bound of sigma."""
-    sigma_max: float = 1.0
+    sigma_max: Positive = 1.0
     """Upper bound of sigma."""
-    mean_limit: float = 1.0
+    mean_limit: Positive = 1.0
     """Bound of |mu|."""
     value_limit: float | None = 2.0
-    """Bound of |value| of the following state in the TD error, twice the goal's reward; None for
-    no bound."""
-    replays: int = 100
+    """Bound of |value| of the next state in the TD error, twice the goal's reward; None for no
+    bound."""
+    replays: Annotated[int, Within(least=0)] = 100
     """Batches of remembered decisions to learn from again at the beginning of each trial; 0 for
     none. Needs baseline `value`."""
-    memory: int = 20_000
+    memory: Annotated[Count, Within(most=10_000_000)] = 20_000
     """Decisions that are remembered."""
 
+    def __post_init__(self) -> None:
+        """Check the numbers, and the bounds against each other."""
+        super().__post_init__()
+        if not self.sigma_min <= self.sigma_initial <= self.sigma_max:
+            raise ValueError("need --sga.sigma-min <= --sga.sigma-initial <= --sga.sigma-max")
+        if self.replays and self.baseline == "constant":
+            raise ValueError("--sga.replays needs --sga.baseline value: set --sga.replays 0")
 
-def surprise(action: Tensor, mean: Tensor, deviation: Tensor) -> Tensor:
+    def idle(self) -> dict[str, str]:
+        """Settings that change nothing beside the others, and why."""
+        valued = "with --sga.baseline value"
+        constant = dict.fromkeys(
+            ("rate_value", "initial_value", "value_limit"), "without a learned baseline"
+        )
+        idle = {"constant": valued} if self.baseline == "value" else constant
+        return idle if self.replays else idle | {"memory": "with --sga.replays 0"}
+
+
+def negative_log_likelihood(action: Tensor, mean: Tensor, deviation: Tensor) -> Tensor:
     """Minus the logarithm of equation 5, but for its constant. Shape: that of the arguments."""
     z = (action - mean) / deviation
     return torch.addcmul(deviation.log(), z, z, value=0.5)
 
 
-def log_likelihood(action: Tensor, mean: Tensor, deviation: Tensor) -> Tensor:
-    """Logarithm of equation 5, with sigma outside the root. Shape: that of the arguments."""
-    return -surprise(action, mean, deviation) - 0.5 * math.log(2 * math.pi)
-
-
-def n_actions(actions: Actions) -> int:
-    """Length of the action vector a: 2 for wheel speeds, 1 otherwise."""
-    return 2 if actions == "wheels" else 1
-
-
-class SGA:
+class SGA(Learner):
     """The learner of section 3. Rows of the consequents: mu (m), sigma (m), value (1 if learned).
+
+    Of discrete actions one is taken for each of as many equal parts of the range [-1, 1] of a
+    single normal action; other tasks have one normal action for each number of their actions.
 
     Args:
         net: network with ``2 m`` outputs, ``2 m + 1`` with a learned baseline.
-        config: the settings; their initial values are those of the network.
+        task: what is learned.
+        settings: of the learner; their initial values are those of the network.
         seed: seed of the action sampling.
 
     Raises:
-        ValueError: the network has another number of outputs, the bounds are not ordered, or
-            replays lack the learned baseline.
+        ValueError: the network has another number of inputs or outputs.
+
+    Example:
+        >>> from sofnn_torch.network.axes import named
+        >>> task = Task(named(2), ("left", "right"), discrete=True)
+        >>> agent = SGA(SOFNN(2, 3, width=0.2, initial=[0.0, 0.3, 0.65]), task, SGAConfig())
+        >>> agent.start(np.array([0.1, 0.2])) in (0, 1)
+        True
     """
 
-    def __init__(self, net: SOFNN, config: SGAConfig, seed: int = 0):
-        m, learned = n_actions(config.actions), config.baseline == "value"
-        if net.n_outputs != 2 * m + learned:
-            raise ValueError(
-                f"SGA needs {2 * m + learned} outputs, the network has {net.n_outputs}"
-            )
-        if not 0 < config.sigma_min <= config.sigma_max:
-            bounds = f"{config.sigma_min} and {config.sigma_max}"
-            raise ValueError(f"need 0 < sigma_min <= sigma_max, got {bounds}")
-        if config.replays and not learned:
-            raise ValueError("replays need the learned baseline: without it set replays to 0")
-        self.net, self.config, self.m, self.learned = net, config, m, learned
-        self.gamma, self.decay = config.gamma, config.gamma * config.trace_decay
-        self.value_limit = math.inf if config.value_limit is None else config.value_limit
-        self.rng = np.random.default_rng(seed)
-        self.antecedents = config.rate_centre > 0 or config.rate_width > 0
-        scale = 1 - config.gamma if config.one_minus_gamma else 1.0
-        rates = [config.rate_mean * scale] * m + [config.rate_deviation * scale] * m
-        rates += [config.rate_value] * learned
+    name = "sga"
+    greedy = "mean"
+    Settings = SGAConfig
+
+    def __init__(self, net: SOFNN, task: Task, settings: SGAConfig, seed: int = 0):
+        super().__init__(net, task, settings, seed)
+        m, learned = _numbers(task), settings.baseline == "value"
+        self.m, self.learned = m, learned
+        self.gamma, self.decay = settings.gamma, settings.gamma * settings.trace_decay
+        self.value_limit = math.inf if settings.value_limit is None else settings.value_limit
+        self.antecedents = settings.rate_centre > 0 or settings.rate_width > 0
+        scale = 1 - settings.gamma if settings.one_minus_gamma else 1.0
+        rates = [settings.rate_mean * scale] * m + [settings.rate_deviation * scale] * m
+        rates += [settings.rate_value] * learned
         if self.antecedents:
             n = net.n_inputs
-            rates = [config.rate_centre * scale] * n + [config.rate_width * scale] * n + rates
-        self.rates = net.default_width.new_tensor(rates)[:, None]
+            rates = [settings.rate_centre * scale] * n + [settings.rate_width * scale] * n + rates
+        self.rates = column(net, rates)
         self.one = self.rates.new_ones(1)
         self.parts = (m, m, 1) if learned else (m, m)  # outputs mu, sigma and value
         self.replay_rates = self.rates[-net.n_outputs :]
-        if config.replays:
-            n = net.n_inputs
-            fields = {"state": n, "action": m, "surprise": 0}
-            fields |= {"reward": 0, "goes_on": 0, "following": n}
-            dtype = net.default_width.cpu().numpy().dtype
-            self.memory = ReplayMemory(fields, config.memory, dtype)
-        self.decision: list[float] = []  # state, action and its surprise
-        self.value = 0.0
-        self._log = {"mu": [], "sigma": [], "error": [], "firing": []}
+        # Between them lie the parts of the range that stand for discrete actions.
+        parts = len(task.actions)
+        self.edges = [(2 * j - parts) / parts for j in range(1, parts)]
+        if settings.replays:
+            fields = {"state": net.n_inputs, "action": m, "negative_log_likelihood": 0}
+            self._remember(fields, settings.memory)
 
-    def start(self, observation: np.ndarray) -> int | np.ndarray:
-        """Begin a trial at the observation (n,): clear the traces, choose the first action."""
-        self.net.traces.zero_()
-        if self.config.replays and len(self.memory):
-            self._replay()
-        x = self._tensor(observation)
-        return self._choose(x, self.net.observe(x))
+    @classmethod
+    def layout(cls, settings: SGAConfig, task: Task) -> Layout:
+        """The state, and mean and deviation of each action, and the value if it is learned."""
+        of = [f" {name}" for name in task.actions] if _numbers(task) > 1 else [""]
+        limit, low, high = settings.mean_limit, settings.sigma_min, settings.sigma_max
+        outputs = [Output(f"mu{name}", 0.0, -limit, limit) for name in of]
+        outputs += [Output(f"sigma{name}", settings.sigma_initial, low, high) for name in of]
+        if settings.baseline == "value":
+            # An unknown state keeps its initial value: optimism is what makes a robot explore.
+            outputs.append(Output("value", settings.initial_value, interpolates=False))
+        return task.axes, tuple(outputs)
 
-    def step(
-        self, reward: float, observation: np.ndarray, terminated: bool, truncated: bool = False
-    ) -> int | np.ndarray | None:
-        """Learn from the reward of the last action, then choose the next (None at the end).
-
-        Args:
-            reward: reward of the last action.
-            observation: the state that it led to. Shape: (n,).
-            terminated: no state follows this one; its value is 0.
-            truncated: the trial ends here, but not the robot's way: the value of the state counts.
-        """
-        if self.config.replays:
-            self.memory.add([*self.decision, reward, not terminated, *observation.tolist()])
-        if terminated:
-            self._learn(reward - self.value if self.learned else reward - self.config.constant)
-            return None
-        x = self._tensor(observation)
-        firing = self.net.observe(x)
-        error = reward - self.config.constant
-        if self.learned:
-            ahead, limit = self.net.conclude(firing).tolist()[-1], self.value_limit
-            error = reward + self.gamma * min(max(ahead, -limit), limit) - self.value
-        self._learn(error)
-        return None if truncated else self._choose(x, firing)
-
-    def act(self, observation: np.ndarray, explore: float = 0) -> int | np.ndarray:
+    def act(self, observation: NDArray[Any], explore: float = 0) -> Action:
         """The mean action, or a sampled one; learns nothing and adds no rule.
 
         Args:
@@ -189,41 +178,19 @@ class SGA:
         mean, sigma = np.array(outputs[: self.m]), np.array(outputs[self.m : 2 * self.m])
         return self._command(self.rng.normal(mean, explore * sigma) if explore else mean)
 
-    def strongest_rule(self, observation: np.ndarray) -> int:
-        """The rule that fires most at the state (n,)."""
-        with torch.no_grad():
-            return int(self.net.normalised_firing(self._tensor(observation)).argmax())
+    def alone(self, conclusions: NDArray[np.float64]) -> NDArray[np.int64] | None:
+        """The action that each mean stands for. Shape: (K,)."""
+        return np.searchsorted(self.edges, conclusions[:, 0]) if self.choices else None
 
-    def statistics(self) -> dict[str, float]:
-        """Means over the decisions since the last call (docs/metrics.md); starts afresh."""
-        log, self._log = self._log, {name: [] for name in self._log}
-        if not log["mu"]:
-            return {}
-        mu, sigma = self.rates.new_tensor(log["mu"]), self.rates.new_tensor(log["sigma"])
-        error = torch.tensor(log["error"] or [0.0])
-        return {
-            "policy/mu_mean": mu.mean().item(),
-            "policy/mu_deviation": mu.std(unbiased=False).item(),
-            "policy/sigma_mean": sigma.mean().item(),
-            "policy/sigma_min": sigma.min().item(),
-            "learning/error_rms": error.square().mean().sqrt().item(),
-        } | self.net.statistics(log["firing"])
+    def _policy(self, x: Tensor) -> tuple[Tensor, Tensor | None]:
+        outputs = self.net(x)
+        value = outputs[:, -1] if self.learned else None
+        actions = outputs[:, : self.m].clamp(-1, 1)
+        if self.choices:
+            return torch.bucketize(actions[:, 0], actions.new_tensor(self.edges)), value
+        return actions, value
 
-    def state_dict(self) -> dict:
-        """Everything that the future depends on, as tensors, numbers and text."""
-        rng = self.rng.bit_generator.state
-        state = {"net": self.net.state_dict(), "rng": rng, "value": self.value}
-        return state | ({"memory": self.memory.state_dict()} if self.config.replays else {})
-
-    def load_state_dict(self, state: dict) -> None:
-        """Counterpart of `state_dict`; a fresh learner takes the size of the stored network."""
-        self.net.load_state_dict(state["net"])
-        self.rng.bit_generator.state = state["rng"]
-        self.value = state["value"]
-        if self.config.replays:
-            self.memory.load_state_dict(state["memory"])
-
-    def _choose(self, x: Tensor, firing: Tensor) -> int | np.ndarray:
+    def _choose(self, x: Tensor, firing: Tensor) -> Action:
         """Sample an action (eq. 5) and add its eligibility to the traces (eq. 6)."""
         net, m = self.net, self.m
         parameters = consequents = net.learnable(self.antecedents)
@@ -235,67 +202,88 @@ class SGA:
         mu, sigma = numbers[:m], numbers[m : 2 * m]
         noise = [self.rng.standard_normal() for _ in range(m)]
         action = [u + s * z for u, s, z in zip(mu, sigma, noise, strict=True)]
-        scale = [-s * s for s in sigma] if self.config.variance_scaled else [-1.0] * m
+        scale = [-s * s for s in sigma] if self.settings.variance_scaled else [-1.0] * m
         taken, weights = x.new_tensor([action, scale])
         mean, deviation, *value = outputs.split_with_sizes(self.parts)
-        unexpected = surprise(taken, mean, deviation)
+        likelihood = negative_log_likelihood(taken, mean, deviation)
         if self.learned:  # the gradient of V is the trace of TD(lambda); it moves no antecedents
             self.value = numbers[-1]
             # With fixed antecedents the last output has the same gradient, and a cheaper graph.
             values = [consequents[-1:] @ firing.detach()] if self.antecedents else value
-            gradient = torch.autograd.grad((unexpected, *values), parameters, (weights, self.one))
+            gradient = torch.autograd.grad((likelihood, *values), parameters, (weights, self.one))
         else:
-            gradient = torch.autograd.grad(unexpected, parameters, weights)
+            gradient = torch.autograd.grad(likelihood, parameters, weights)
         net.accumulate(gradient[0], self.decay)
-        if self.config.replays:
-            unlikely = sum(math.log(s) + z * z / 2 for s, z in zip(sigma, noise, strict=True))
-            self.decision = [*x.tolist(), *action, unlikely]
+        if self.memory is not None:
+            then = sum(math.log(s) + z * z / 2 for s, z in zip(sigma, noise, strict=True))
+            self.decision = [*x.tolist(), *action, then]
         self._log["mu"] += mu
         self._log["sigma"] += sigma
         self._log["firing"].append(net.max_firing)
         return self._command(action)
 
+    def _error(self, reward: float, x: Tensor | None = None, firing: Tensor | None = None) -> float:
+        """The reinforcement r - b of equation 7; with a learned baseline the TD error."""
+        if not self.learned:
+            return reward - self.settings.constant
+        if firing is None:
+            return reward - self.value
+        ahead, limit = self.net.conclude(firing).tolist()[-1], self.value_limit
+        return reward + self.gamma * min(max(ahead, -limit), limit) - self.value
+
     def _learn(self, error: float) -> None:
-        """Equations 7 and 8 for the reinforcement error r - b, then the bounds of mu and sigma."""
+        """Equations 7 and 8 for the reinforcement r - b, then the bounds of mu and sigma."""
         self._log["error"].append(error)
         self.net.adapt(self.rates, error)
         self._bound()
 
     def _bound(self) -> None:
-        self.net.clamp_consequents(0, self.m, -self.config.mean_limit, self.config.mean_limit)
-        self.net.clamp_consequents(self.m, 2 * self.m, self.config.sigma_min, self.config.sigma_max)
+        m, settings = self.m, self.settings
+        self.net.clamp_consequents(0, m, -settings.mean_limit, settings.mean_limit)
+        self.net.clamp_consequents(m, 2 * m, settings.sigma_min, settings.sigma_max)
 
-    def _replay(self) -> None:
+    def _replay(self, memory: ReplayMemory) -> None:
         """Equations 5-8 without traces for batches of remembered decisions; the antecedents stay.
 
         Another policy took them: each counts min(1, pi(a | x) now / then) (Wawrzynski, Neural
         Networks 22, 2009; Espeholt et al., ICML 2018).
         """
         net, (features, firing_at) = self.net, self.net.firing_functions()
-        seen = self.memory.sample(self.config.replays, self.rng, self.rates)
-        here, there = features(seen.pop("state")), features(seen.pop("following"))
-        for x, following, *row in zip(here, there, *seen.values(), strict=True):
-            action, then, reward, goes_on = row
+        seen = memory.sample(self.settings.replays, self.rng, self.rates)
+        states, next_states = features(seen.pop("state")), features(seen.pop("next_state"))
+        for x, next_x, *row in zip(states, next_states, *seen.values(), strict=True):
+            action, then, reward, continues = row
             firing = firing_at(x)
-            ahead = firing_at(following) @ net.consequents[:, -1]
+            ahead = firing_at(next_x) @ net.consequents[:, -1]
             ahead.clamp_(-self.value_limit, self.value_limit)
             consequents = net.learnable(antecedents=False)
             mean, deviation, value = (consequents @ firing.T).split_with_sizes(self.parts)
-            unexpected = surprise(action.T, mean, deviation)
-            ratio = (then - unexpected.detach().sum(0)).exp_().clamp_(max=1.0)
-            error = reward + self.gamma * goes_on * ahead - value.detach()
+            now = negative_log_likelihood(action.T, mean, deviation)
+            ratio = (then - now.detach().sum(0)).exp_().clamp_(max=1.0)
+            error = reward + self.gamma * continues * ahead - value.detach()
             weights, spread = ratio * error, deviation.detach()
-            scale = spread.square() if self.config.variance_scaled else torch.ones_like(spread)
+            scale = spread.square() if self.settings.variance_scaled else torch.ones_like(spread)
             (gradient,) = torch.autograd.grad(
-                (value, unexpected), consequents, (weights, -weights * scale)
+                (value, now), consequents, (weights, -weights * scale)
             )
             net.adapt_batch(self.replay_rates, gradient, ratio @ firing)
             self._bound()
 
-    def _tensor(self, observation: np.ndarray) -> Tensor:
-        return torch.from_numpy(observation).to(self.rates)
+    def _summary(self, log: dict[str, list[float]]) -> dict[str, float]:
+        mu, sigma = self.rates.new_tensor(log["mu"]), self.rates.new_tensor(log["sigma"])
+        return {
+            "policy/mu_mean": mu.mean().item(),
+            "policy/mu_deviation": mu.std(unbiased=False).item(),
+            "policy/sigma_mean": sigma.mean().item(),
+            "policy/sigma_min": sigma.min().item(),
+        }
 
-    def _command(self, action: Sequence[float] | np.ndarray) -> int | np.ndarray:
-        if self.config.actions != "three":
-            return np.clip(action, -1, 1).astype(np.float32)
-        return RIGHT if action[0] < -1 / 3 else LEFT if action[0] > 1 / 3 else STRAIGHT
+    def _command(self, action: Sequence[float] | NDArray[np.float64]) -> Action:
+        if self.choices:
+            return bisect.bisect_left(self.edges, action[0])
+        return np.clip(action, -1, 1).astype(np.float32)
+
+
+def _numbers(task: Task) -> int:
+    """Length m of the action vector a."""
+    return 1 if task.discrete else len(task.actions)

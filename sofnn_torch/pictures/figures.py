@@ -29,11 +29,11 @@ from matplotlib.ticker import (
 )
 from numpy.typing import NDArray
 
-from sofnn_torch.learners.survey import survey
+from sofnn_torch.learners.learner import Learner
+from sofnn_torch.maze.odometry import motion
 
 if TYPE_CHECKING:
     from sofnn_torch.maze.robot import MazePlan
-    from sofnn_torch.runs.factory import Agent
     from sofnn_torch.runs.trial import Trajectory
 
 BLUE, ORANGE, GREEN, VERMILION = "#0072B2", "#E69F00", "#009E73", "#D55E00"
@@ -168,7 +168,7 @@ def _turn_legend(ax: Axes, symbol: str) -> None:
 
 @styled
 def rule_map(
-    plan: "MazePlan", agent: "Agent", ax: Axes, weights: NDArray[Any] | None = None
+    plan: "MazePlan", agent: Learner, ax: Axes, weights: NDArray[Any] | None = None
 ) -> None:
     """Every rule at its centre, a tick towards its heading, coloured by the action there.
 
@@ -180,7 +180,8 @@ def rule_map(
     """
     maze_plan(plan, ax, labels=False)
     centres = agent.net.centres[:, :3].double().numpy()
-    colours = TURNS(Normalize(-1, 1)(survey(agent, centres).turn))
+    _, turn = motion(agent.plan(centres).actions)
+    colours = TURNS(Normalize(-1, 1)(turn))
     sizes = np.full(len(centres), 6.0)
     if weights is not None:
         sizes = 2 + 18 * np.sqrt(weights / max(weights.max(), 1e-12))
@@ -190,13 +191,10 @@ def rule_map(
 
 
 @styled
-def memberships(
-    plan: "MazePlan", agent: "Agent", i: int, ax: Axes, names: Mapping[int, str]
-) -> None:
-    """Membership functions (eq. 1) of some rules on input i: x, y, heading or action.
+def memberships(agent: Learner, i: int, ax: Axes, names: Mapping[int, str]) -> None:
+    """Membership functions (eq. 1) of some rules on input i.
 
     Args:
-        plan: the maze, for the range of positions.
         agent: the learner.
         i: number of the input.
         ax: where to draw.
@@ -207,25 +205,28 @@ def memberships(
     """
     if len(names) > len(SERIES):
         raise ValueError(f"at most {len(SERIES)} rules can be told apart, got {len(names)}")
-    x0, y0, x1, y1 = bounds(plan)
-    low, high = ((x0, x1), (y0, y1), (-math.pi, math.pi), (-1.0, 1.0))[i]
-    x, period = np.linspace(low, high, 400), agent.net.periods[i].item()
-    scale = 180 / math.pi if period else 1.0
+    axis = agent.inputs[i]
+    x, turns = np.linspace(axis.low, axis.high, 400), axis.unit == "rad"
+    scale = 180 / math.pi if turns else 1.0
     for (rule, name), (colour, line) in zip(names.items(), SERIES, strict=False):
         distance = x - agent.net.centres[rule, i].item()
-        if period:
-            distance -= period * np.round(distance / period)
+        if axis.period:
+            distance -= axis.period * np.round(distance / axis.period)
         curve = np.exp(-0.5 * (distance / agent.net.widths[rule, i].item()) ** 2)
         ax.plot(scale * x, curve, color=colour, linestyle=line, linewidth=1.4, label=name)
-    label = ("x [m]", "y [m]", "heading [degrees]", "action: right turn (-1) to left turn (1)")[i]
-    ax.set(xlabel=label, xlim=(scale * low, scale * high), ylim=(0, 1.05), yticks=(0, 1))
-    ax.xaxis.set_major_locator(MultipleLocator(90 if period else 0.2 if i < 2 else 0.5))
+    label = f"{axis.name} [{'degrees' if turns else axis.unit}]"
+    if not axis.unit:
+        first, last = agent.task.actions[0], agent.task.actions[-1]
+        label = f"{axis.name}: {first} (-1) to {last} (1)"
+    limits = (scale * axis.low, scale * axis.high)
+    ax.set(xlabel=label, xlim=limits, ylim=(0, 1.05), yticks=(0, 1))
+    ax.xaxis.set_major_locator(MultipleLocator(90 if turns else 0.2 if axis.unit else 0.5))
 
 
 @styled
 def rules(
     plan: "MazePlan",
-    agent: "Agent",
+    agent: Learner,
     weights: NDArray[Any],
     texts: Sequence[str],
 ) -> Figure:
@@ -253,7 +254,7 @@ def rules(
         _note(ax, str(rule + 1), at, 7, ha="center", path_effects=halo, zorder=7)
     for i in range(inputs):
         ax = figure.add_subplot(cells[i, 1])
-        memberships(plan, agent, i, ax, names)
+        memberships(agent, i, ax, names)
         if i == inputs // 2:
             ax.set_ylabel("membership")
         if i == 0:
@@ -282,7 +283,7 @@ def _grid(plan: "MazePlan", columns: int, headings: int) -> tuple[NDArray[Any], 
 
 @styled
 def action_field(
-    plan: "MazePlan", agent: "Agent", ax: Axes, columns: int = 10, headings: int = 8
+    plan: "MazePlan", agent: Learner, ax: Axes, columns: int = 10, headings: int = 8
 ) -> None:
     """The policy: at each position a rosette of headings, and where they lead.
 
@@ -294,21 +295,21 @@ def action_field(
     poses, free = _grid(plan, columns, headings)
     mask = np.repeat(free, headings)
     poses = poses[mask]
-    plans = survey(agent, poses)
+    forward, turn = motion(agent.plan(poses).actions)
     ahead = np.column_stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])])
     aside = np.column_stack([-ahead[:, 1], ahead[:, 0]])
     step = np.ptp(bounds(plan)[::2]) / columns
     begin = poses[:, :2] + 0.18 * step * ahead
-    forward, turn = np.clip(plans.forward, 0, 1)[:, None], plans.turn[:, None]
+    colours = TURNS(Normalize(-1, 1)(turn))
+    forward, turn = np.clip(forward, 0, 1)[:, None], turn[:, None]
     end = begin + 0.24 * step * (forward * ahead + turn * aside)
-    colours = TURNS(Normalize(-1, 1)(plans.turn))
     spokes = LineCollection(np.stack([begin, end], 1), colors=colours, linewidths=0.8, zorder=4)
     ax.add_collection(spokes, autolim=False)
-    motion = (forward * ahead).reshape(-1, headings, 2).mean(1)
-    length = np.hypot(*motion.T)
+    mean = (forward * ahead).reshape(-1, headings, 2).mean(1)
+    length = np.hypot(*mean.T)
     ax.quiver(
         *poses[::headings, :2].T,
-        *(motion / np.maximum(length, 1e-9)[:, None] * 0.4 * step).T,
+        *(mean / np.maximum(length, 1e-9)[:, None] * 0.4 * step).T,
         angles="xy",
         scale_units="xy",
         scale=1,
@@ -322,7 +323,7 @@ def action_field(
 
 @styled
 def value_field(
-    plan: "MazePlan", agent: "Agent", ax: Axes, columns: int = 40, headings: int = 8
+    plan: "MazePlan", agent: Learner, ax: Axes, columns: int = 40, headings: int = 8
 ) -> None:
     """Value of the best heading at each position.
 
@@ -330,7 +331,7 @@ def value_field(
         ValueError: the learner keeps no value (SGA with a constant baseline).
     """
     poses, _ = _grid(plan, columns, headings)
-    value = survey(agent, poses).value
+    value = agent.plan(poses).value
     if value is None:
         raise ValueError("this learner keeps no value: it was trained with --sga.baseline constant")
     picture = value.reshape(-1, columns, headings).max(2)

@@ -9,15 +9,16 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from sofnn_torch.learners.frozen import FrozenPolicy
+from sofnn_torch.learners.learner import Learner
 from sofnn_torch.maze.rendering import OffscreenRenderer
 from sofnn_torch.maze.robot import load_model
-from sofnn_torch.runs.factory import Agent, make_env
+from sofnn_torch.runs.factory import make_env
 from sofnn_torch.runs.settings import Config
 
 
 def film(
     config: Config,
-    agent: Agent,
+    agent: Learner,
     seed: int = 0,
     explore: bool = False,
     steps_per_frame: int = 2,
@@ -53,7 +54,8 @@ def film(
         if len(trail) % steps_per_frame == 0:
             shoot()
 
-    rng, agent.rng = agent.rng, np.random.default_rng(seed)  # a film must not change the training
+    rng = agent.rng  # a film must not change the training
+    agent.reseed(seed)
     try:
         env.reset(seed=seed)
         policy = FrozenPolicy(agent, explore)

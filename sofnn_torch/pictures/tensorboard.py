@@ -19,12 +19,12 @@ from PIL import Image
 from tensorboard.compat.proto.summary_pb2 import Summary
 from torch.utils.tensorboard.summary import hparams
 
-from sofnn_torch.learners.survey import usage
+from sofnn_torch.learners.learner import Learner
 from sofnn_torch.pictures import figures
 from sofnn_torch.pictures.events import EventFile
 from sofnn_torch.pictures.film import film, gif
 from sofnn_torch.runs.directory import flatten
-from sofnn_torch.runs.factory import Agent, make_env
+from sofnn_torch.runs.factory import make_env
 from sofnn_torch.runs.settings import Config
 from sofnn_torch.runs.trial import Trajectory, TrialRecord
 from sofnn_torch.terminal import say
@@ -64,7 +64,7 @@ class Monitor:
         self._guard("TensorBoard", lambda: self._open(first_trial))
 
     def trial(
-        self, record: TrialRecord, path: Trajectory, agent: Agent, steps_per_second: float
+        self, record: TrialRecord, path: Trajectory, agent: Learner, steps_per_second: float
     ) -> None:
         """Write the scalars of a trial and, when their turn has come, pictures and a video.
 
@@ -149,7 +149,7 @@ class Monitor:
         self._events.add(Summary(value=scalars), record.trial)
         self._events.flush()
 
-    def _pictures(self, trial: int, path: Trajectory, agent: Agent) -> None:
+    def _pictures(self, trial: int, path: Trajectory, agent: Learner) -> None:
         if self._plan is None:
             env = make_env(self.config)
             self._plan = env.unwrapped.plan
@@ -157,11 +157,11 @@ class Monitor:
         plan, states = self._plan, path.decided_at(self.config.pose)
         drawings = {
             "trajectory": lambda ax: figures.trajectory(plan, path, ax),
-            "rules": lambda ax: figures.rule_map(plan, agent, ax, usage(agent, states)),
+            "rules": lambda ax: figures.rule_map(plan, agent, ax, agent.usage(states)),
             "policy": lambda ax: figures.action_field(plan, agent, ax),
             "pose_error": lambda ax: figures.pose_error(path, ax, plan),
         }
-        if getattr(agent, "learned", True):  # an SGA with a constant baseline knows no values
+        if agent.plan(states[:1]).value is not None:
             drawings["value"] = lambda ax: figures.value_field(plan, agent, ax)
         for name, draw in drawings.items():
             figure, (ax,) = figures.canvas(width=5, height=5, tight=False)
@@ -169,7 +169,7 @@ class Monitor:
             self._image(f"pictures/{name}", figures.png(figure, dpi=100), trial)
         gc.collect()  # figures refer to themselves: 200 MiB would wait for the next full collection
 
-    def _video(self, trial: int, agent: Agent) -> None:
+    def _video(self, trial: int, agent: Learner) -> None:
         frames = film(self.config, agent, steps_per_frame=10, limit=VIDEO_STEPS, size=240)
         self._image("video/evaluation", gif(frames), trial)
 

@@ -24,14 +24,15 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
+from sofnn_torch.bounds import Settings, Within
 from sofnn_torch.evaluate import learned, load
-from sofnn_torch.learners.survey import usage
+from sofnn_torch.learners.learner import Learner
 from sofnn_torch.pictures import figures
 from sofnn_torch.rules import files, words
 from sofnn_torch.rules.words import Decision, Reading, number
 from sofnn_torch.runs import checkpoint
 from sofnn_torch.runs.directory import Run, first_free
-from sofnn_torch.runs.factory import Agent, make_env
+from sofnn_torch.runs.factory import make_env
 from sofnn_torch.runs.session import RunOptions, arithmetic, home_of
 from sofnn_torch.runs.settings import Config
 from sofnn_torch.terminal import command, plural, say
@@ -44,12 +45,12 @@ FIRED = 0.01  # a rule with less firing in all of a trial took no part, as in do
 
 
 @dataclass(frozen=True)
-class Options:
+class Options(Settings):
     """Print the learned rules of a run as a table, the most used first; write, edit, explain."""
 
     run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
     """Directory of the run, or one of its checkpoint files."""
-    top: int = 20
+    top: Annotated[int, Within(least=0)] = 20
     """Rules in the table; 0 for all."""
     at: tuple[float, float, float] | None = None
     """Show which rules decide at a pose instead: x and y in metres, heading in degrees."""
@@ -63,7 +64,7 @@ class Options:
     """Make a new run out of this one and the rules in a .json or .csv file."""
     name: str | None = None
     """Name of the new run; by default that of the old one with `-edited`."""
-    seed: int = 1000
+    seed: Annotated[int, Within(least=0)] = 1000
     """Seed of the trial that shows how much each rule is used."""
 
 
@@ -73,11 +74,8 @@ def check(options: Options) -> None:
     Raises:
         ValueError: naming the flag.
     """
-    for flag in ("top", "seed"):
-        if getattr(options, flag) < 0:
-            raise ValueError(f"--{flag} must not be negative, got {getattr(options, flag)}")
     if options.at and not all(abs(value) < 1e6 for value in options.at):
-        raise ValueError(f"--at needs three finite numbers, got {options.at}")
+        raise ValueError(f"--at must be a pose in metres and degrees, got {options.at}")
     if options.name is not None and not options.load:
         raise ValueError("--name goes with --load")
     RunOptions(name=options.name)
@@ -93,17 +91,19 @@ def check(options: Options) -> None:
         raise ValueError(f"{given[0]} and {given[1]} do not go together: use two commands")
 
 
-def firing_along_a_trial(config: Config, agent: Agent, seed: int) -> tuple[NDArray[Any], int, str]:
+def firing_along_a_trial(
+    config: Config, agent: Learner, seed: int
+) -> tuple[NDArray[Any], int, str]:
     """Share of each rule (K,) in a trial without learning, its decisions, and how it went."""
     env = make_env(config)
     try:
         env.reset(seed=seed)
-        agent.rng = np.random.default_rng(seed)
+        agent.reseed(seed)
         record, path = play(env, agent, learn=False, explore=False)
     finally:
         env.close()
     outcome = f"{'goal' if record.success else 'no goal'} after {record.steps:,} steps"
-    return usage(agent, path.decided_at(config.pose)), record.decisions, outcome
+    return agent.usage(path.decided_at(config.pose)), record.decisions, outcome
 
 
 def summary(shares: NDArray[Any], decisions: int, reading: Reading) -> str:
@@ -189,7 +189,9 @@ def warn_outside(config: Config, x: float, y: float) -> None:
         say(f"warning: --at {x:g} {y:g} is outside the maze of {width:g} x {height:g} m")
 
 
-def edit(options: Options, config: Config, agent: Agent, path: Path, state: dict[str, Any]) -> Path:
+def edit(
+    options: Options, config: Config, agent: Learner, path: Path, state: dict[str, Any]
+) -> Path:
     """Make a run with other rules and the rest of a state; its directory.
 
     Raises:
@@ -223,7 +225,7 @@ def edit(options: Options, config: Config, agent: Agent, path: Path, state: dict
     return run.path
 
 
-def write(options: Options, config: Config, agent: Agent, reading: Reading, shares: Any) -> None:
+def write(options: Options, config: Config, agent: Learner, reading: Reading, shares: Any) -> None:
     """Write the files that were asked for.
 
     Raises:

@@ -16,13 +16,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sofnn_torch.learners.sga import SGA
-from sofnn_torch.runs.factory import Agent
+from sofnn_torch.learners.learner import Learner
 from sofnn_torch.runs.guard import FARTHEST, LARGEST, WIDEST
 
 FORMAT, VERSION = "sofnn-torch rules", 1
 SUFFIXES = (".json", ".csv")
-INPUTS = (("x", "m"), ("y", "m"), ("heading", "rad"), ("action", ""))
 TWICE = object()  # key of the name that an object of a JSON file has twice
 
 
@@ -70,37 +68,24 @@ class Schema:
         return 2**20 + self.counts[1] * (512 + 32 * len(self.low))
 
 
-def schema(agent: Agent) -> Schema:
+def schema(agent: Learner) -> Schema:
     """The schema of a learner. Bounds are those that the guard or the learner keeps."""
     net = agent.net
     n, m = net.n_inputs, net.n_outputs
     table = net.default_width.cpu().numpy()
     low, high = np.empty(2 * n + m, table.dtype), np.empty(2 * n + m, table.dtype)
-    periods = net.periods.flatten().cpu().numpy()
-    high[:n] = np.where(periods > 0, periods, FARTHEST)  # degrees in place of radians stand out
+    # Degrees in place of radians stand out.
+    high[:n] = [axis.period or FARTHEST for axis in agent.inputs]
     high[n : 2 * n], high[2 * n :] = WIDEST * table, LARGEST
     high = np.nextafter(high, np.zeros_like(high))  # the guard refuses the limit itself
     low[:] = -high
     low[n : 2 * n] = net.min_width
-    if isinstance(agent, SGA):
-        mean, deviation = slice(2 * n, 2 * n + agent.m), slice(2 * n + agent.m, 2 * n + 2 * agent.m)
-        low[mean], high[mean] = -agent.config.mean_limit, agent.config.mean_limit
-        low[deviation], high[deviation] = agent.config.sigma_min, agent.config.sigma_max
-        sides = ("_left", "_right") if agent.m == 2 else ("",)
-        outputs = [f"{name}{side}" for name in ("mu", "sigma") for side in sides]
-        outputs += ["value"] * agent.learned
-    else:
-        segments = [f"c_segment_{j + 1}" for j in range(agent.segments)]
-        if agent.config.actions == "three":
-            segments = ["c_right", "c_straight", "c_left"]
-        actions = {
-            "onehot": segments,
-            "wheels": ["c_wheel_left", "c_wheel_right"],
-        }.get(agent.coding, ["c_action"])
-        outputs = [*(f"c_{name}" for name, _ in INPUTS[: agent.n]), *actions, "c"]
+    for row, output in enumerate(agent.outputs, 2 * n):
+        low[row], high[row] = max(low[row], output.low), min(high[row], output.high)
     counts = (net.n_rules, net.n_rules) if net.growth == "frozen" else (1, net.max_rules)
-    kind = "sga" if isinstance(agent, SGA) else "q"
-    return Schema(kind, INPUTS[:n], tuple(outputs), low, high, counts)
+    inputs = tuple((axis.name, axis.unit) for axis in agent.inputs)
+    outputs = tuple(output.name.replace(" ", "_") for output in agent.outputs)
+    return Schema(agent.name, inputs, outputs, low, high, counts)
 
 
 # ------------------------------------------------------------------------------------- writing

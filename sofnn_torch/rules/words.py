@@ -11,12 +11,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from sofnn_torch.learners.sga import SGA
-from sofnn_torch.learners.survey import survey
-from sofnn_torch.runs.factory import Agent
+from sofnn_torch.learners.learner import Learner
+from sofnn_torch.network.axes import Axis
 
 MANY = 5  # actions that are shown side by side
-TURNS = ("right turn", "straight", "left turn")
 WINDS = ("E", "NE", "N", "NW", "W", "SW", "S", "SE")  # east is along x, north along y
 
 
@@ -37,11 +35,16 @@ class Reading:
 
     def brief(self) -> list[str]:
         """The main conclusion of each rule in a few words, for a legend."""
-        (name, cells), *more = self.consequents.items()
-        if more and more[0][0] == "mu right":
-            pairs = zip(cells, more[0][1], strict=True)
-            return [f"wheels {left}, {right}" for left, right in pairs]
-        return [f"{name} {cell}".strip() for cell in cells]
+        first = next(iter(self.consequents)).partition(" ")[0]
+        main = {n: c for n, c in self.consequents.items() if n.partition(" ")[0] == first}
+        if len(main) == 1 or first == "Q":
+            name = next(iter(main))
+            return [f"{name} {cell}".strip() for cell in main[name]]
+        names = [name.removeprefix(f"{first} ") for name in main]
+        return [
+            ", ".join(f"{name} {cell}" for name, cell in zip(names, cells, strict=True))
+            for cells in zip(*main.values(), strict=True)
+        ]
 
     def sentences(self) -> list[str]:
         """Each rule as one line of text."""
@@ -86,101 +89,70 @@ class Decision:
 
 
 @torch.no_grad()
-def read(agent: Agent) -> Reading:
+def read(agent: Learner) -> Reading:
     """All rules of a learner in words."""
     net = agent.net
-    x, y, heading, *action = (
-        list(zip(u, v, strict=True))
-        for u, v in zip(net.centres.T.tolist(), net.widths.T.tolist(), strict=True)
-    )
     columns = {
-        "x, mm": [f"{1000 * u:.0f} ± {1000 * v:.0f}" for u, v in x],
-        "y, mm": [f"{1000 * u:.0f} ± {1000 * v:.0f}" for u, v in y],
-        "heading": [bearing(u, v) for u, v in heading],
+        column(axis): [about(axis, u, v) for u, v in zip(us, vs, strict=True)]
+        for axis, us, vs in zip(
+            agent.inputs, net.centres.T.tolist(), net.widths.T.tolist(), strict=True
+        )
     }
-    for pairs in action:
-        columns["action"] = [f"{number(u)} ± {v:.2f}" for u, v in pairs]
     return Reading(columns, *_consequents(agent))
 
 
-def _consequents(agent: Agent) -> tuple[dict[str, list[str]], NDArray[np.bool_]]:
+def _consequents(agent: Learner) -> tuple[dict[str, list[str]], NDArray[np.bool_]]:
     """The consequents of a `Reading`, and which rules are outvoted."""
-    states = agent.net.centres[:, :3]
-    names, table = conclusions(agent, states)
+    centres = agent.net.centres
+    names, table = agent.conclusions(centres)
     numbers = {name: list(map(number, table[:, i].tolist())) for i, name in enumerate(names)}
-    nobody = np.zeros(len(states), bool)
-    if not (actions := _actions(agent)):
+    nobody = np.zeros(len(centres), bool)
+    if not agent.choices:
         return numbers, nobody
-    turns, scale = survey(agent, states.numpy()).turn, _scale(agent)
-    together = np.abs(turns[:, None] - scale).argmin(1)
-    if agent.net.n_inputs > 3:  # each rule is about one action
-        features = torch.cat([agent.net.centres, states.new_ones(len(states), 1)], 1)
-        values = (agent.net.consequents * features).sum(1).tolist()
-        words = [actions[j] for j in together.tolist()]
-        return {"Q": list(map(number, values)), "best there": words}, nobody
-    if isinstance(agent, SGA):
-        alone = 1 + (table[:, 0] > 1 / 3).astype(int) - (table[:, 0] < -1 / 3)
-    else:
-        alone = table.argmax(1)
-        alone[(table == table.max(1, keepdims=True)).sum(1) > 1] = -1
-    outvoted = (alone >= 0) & (alone != together)
-    said = [*actions, "undecided"]  # the last for -1
-    words = [said[j] for j in alone.tolist()]
+    together = agent.plan(centres[:, : len(agent.task.axes)].numpy()).choice
+    assert together is not None  # there are choices
+    alone = agent.alone(table)
+    if alone is None:  # each rule is about one action
+        return numbers | {"best there": [agent.choices[j] for j in together.tolist()]}, nobody
+    said = [*agent.choices, "undecided"]  # the last for -1
     if len(names) > MANY:
         numbers = {"Q": list(map(number, table.max(1).tolist()))}
-    return {"": words} | numbers, outvoted
-
-
-def conclusions(agent: Agent, x: torch.Tensor) -> tuple[list[str], NDArray[np.float64]]:
-    """What each rule concludes by itself: names (c,) and numbers (K, c).
-
-    For SGA these are the consequents, for Q-learning the values f_k(x, a_j) of all actions (eq. 9).
-
-    Args:
-        agent: the learner.
-        x: the state, one for all rules or one each. Shape: (3,) or (K, 3).
-    """
-    consequents = agent.net.consequents.double()
-    if isinstance(agent, SGA):
-        sides = (" left", " right") if agent.m == 2 else ("",)
-        names = [f"{part}{side}" for part in ("mu", "sigma") for side in sides]
-        return [*names, *["value"] * agent.learned], consequents.numpy()
-    n = agent.n
-    of_state = (consequents[:, :n] * x).sum(1, keepdim=True)
-    values = of_state + consequents[:, n:] @ agent.tails.double().T
-    return [f"Q {name}" for name in _actions(agent)], values.numpy()
+    words = [said[j] for j in alone.tolist()]
+    return {"": words} | numbers, (alone >= 0) & (alone != together)
 
 
 @torch.no_grad()
-def decide(agent: Agent, state: NDArray[np.float32]) -> Decision:
-    """How the rules decide at a state (3,) without exploration."""
+def decide(agent: Learner, state: NDArray[np.float32]) -> Decision:
+    """How the rules decide at a state (n,) without exploration."""
     x = torch.from_numpy(state).to(agent.net.default_width)
-    names, table = conclusions(agent, x)
-    inputs = x[None]
-    if agent.net.n_inputs > 3:
-        inputs = torch.cat([x.expand(len(agent.codes), -1), agent.codes], 1)
-    shares = agent.net.normalised_firing(inputs).double().numpy().T
-    action = agent.act(state)
-    if isinstance(action, int):
-        said = TURNS[action]
+    names, table = agent.conclusions(x)
+    shares = agent.firing(state).double().numpy().T
+    plan = agent.plan(state[None])
+    if plan.choice is not None:
+        said = agent.choices[plan.choice.item()]
     else:
-        parts = ("left wheel", "right wheel") if len(action) == 2 else ("steer",)
-        pairs = zip(parts, action.tolist(), strict=True)
+        pairs = zip(agent.task.actions, plan.actions[0].tolist(), strict=True)
         said = ", ".join(f"{part} {number(value)}" for part, value in pairs)
+    inputs = agent.network_inputs(x).reshape(-1, len(agent.inputs))
     strongest = agent.net.firing_strengths(inputs).max().item()
     return Decision(names, np.broadcast_to(shares, table.shape), table, strongest, said)
 
 
-def _actions(agent: Agent) -> list[str]:
-    """Names of the actions that a learner chooses among; none if they are continuous."""
-    if agent.config.actions == "three":
-        return list(TURNS)
-    return [] if isinstance(agent, SGA) else [f"{a:+.2f}" for a in agent.representatives]
+def column(axis: Axis) -> str:
+    """Heading of the cells of an axis: its name, and the unit in which they are given."""
+    if axis.unit == "rad" and axis.period:
+        return axis.name  # a bearing bears its unit
+    unit = "mm" if axis.unit == "m" else axis.unit
+    return f"{axis.name}, {unit}" if unit else axis.name
 
 
-def _scale(agent: Agent) -> list[float]:
-    """The same actions as turns from -1 to 1."""
-    return [-1.0, 0.0, 1.0] if agent.config.actions == "three" else agent.representatives
+def about(axis: Axis, centre: float, width: float) -> str:
+    """A membership function in a cell: its centre and width, as ``150 ± 60``."""
+    if axis.unit == "rad" and axis.period:
+        return bearing(centre, width)
+    if axis.unit == "m":
+        return f"{1000 * centre:.0f} ± {1000 * width:.0f}"
+    return f"{number(centre)} ± {width:.2f}"
 
 
 def bearing(heading: float, width: float | None = None) -> str:

@@ -21,7 +21,7 @@ from typing import Any
 
 import torch
 
-VERSION = 1
+VERSION = 2
 HEADER = re.compile(rb"sofnn-torch checkpoint (\d{1,9}) ([0-9a-f]{64})\n")
 HEADER_SIZE = 200  # no header line is longer
 NAME = re.compile(r"checkpoint-(\d+)\.pt")
@@ -74,6 +74,11 @@ def load(path: Path) -> dict[str, Any]:
     if version > VERSION:
         raise CheckpointError(
             f"{path}: format {version}, this program reads up to {VERSION}; update sofnn-torch"
+        )
+    if version < VERSION:
+        raise CheckpointError(
+            f"{path}: format {version} of an older version, this program reads {VERSION}: train "
+            "anew, or use the version of sofnn-torch that wrote it (0.1.0)"
         )
     try:
         state = torch.load(io.BytesIO(payload), weights_only=True)

@@ -314,7 +314,7 @@ def flatten(settings: dict[str, Any], prefix: str = "") -> dict[str, Any]:
 
 def default_name(config: Config) -> str:
     """Name of a run directory, e.g. sga-sofnn-estimated-s0."""
-    return f"{config.agent}-{config.network}-{config.pose}-s{config.seed}"
+    return f"{config.learner.name}-{config.network}-{config.pose}-s{config.seed}"
 
 
 def first_free(path: Path) -> Path:

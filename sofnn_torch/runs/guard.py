@@ -5,7 +5,7 @@ import math
 import mujoco
 import numpy as np
 
-from sofnn_torch.runs.factory import Agent
+from sofnn_torch.learners.learner import Learner
 
 FARTHEST = 100.0  # metres, radians: no rule out there ever fires
 WIDEST = 50.0  # times the width of a new rule: it fires everywhere and no more rules are added
@@ -17,7 +17,7 @@ class Divergence(ArithmeticError):
     """Numbers stopped being finite or sensible; the message says which."""
 
 
-def diagnose(agent: Agent, observation: np.ndarray) -> str:
+def diagnose(agent: Learner, observation: np.ndarray) -> str:
     """What is not finite, or beyond all sense, in a learner or its input; empty if nothing is."""
     if not np.isfinite(observation).all():
         return f"the observation is {observation.tolist()}"

@@ -1,40 +1,36 @@
 """Named settings: ``default``, what works best, and ``paper``, every number as printed."""
 
-import dataclasses
+from typing import Any
 
-from sofnn_torch.runs.settings import Config, MazeConfig, NetworkConfig, QConfig, SGAConfig
+from sofnn_torch.learners.qlearning import QConfig
+from sofnn_torch.learners.sga import SGAConfig
+from sofnn_torch.maze.settings import MazeConfig
+from sofnn_torch.network.settings import NetworkConfig
+
+TABLES = ("net", "sga", "q", "maze")
 
 
-def preset(agent: str, network: str, name: str) -> Config:
-    """The settings of a named preset for one of the four learners.
+def tables(agent: str, network: str, name: str) -> dict[str, Any]:
+    """The tables of settings of a named preset for one of the four learners, or one's own."""
+    return _paper(agent) if name == "paper" else _default(agent, network)
 
-    Raises:
-        ValueError: an unknown name.
-    """
-    known = name in ("default", "paper") and agent in ("sga", "q")
-    if not known or network not in ("sofnn", "fixed"):
-        raise ValueError(f"no preset {name!r} for agent {agent!r} and network {network!r}")
-    if name == "paper":
-        return _paper(agent, network)
-    net = NetworkConfig()
+
+def _default(agent: str, network: str) -> dict[str, Any]:
+    theta, position, heading = 0.4, 0.06, 0.45
     if agent == "q":  # greedy action values need sharper sets: wide ones reach through walls
-        net = NetworkConfig(theta=0.3, width_position=0.045, width_heading=0.4)
+        theta, position, heading = 0.3, 0.045, 0.4
     if network == "fixed":  # half the grid's spacing
-        net = dataclasses.replace(net, width_position=0.042, width_heading=0.39)
-    if agent == "sga":
-        return Config(agent="sga", network=network, net=net)
-    return Config(
-        agent="q",
-        network=network,
-        net=net,
-        maze=MazeConfig(goal_reward=100.0, collision_reward=-0.1, subgoal_reward=0.5),
-    )
+        position, heading = 0.042, 0.39
+    maze = MazeConfig()
+    if agent == "q":
+        maze = MazeConfig(goal_reward=100.0, collision_reward=-0.1, subgoal_reward=0.5)
+    net = NetworkConfig(theta=theta, width_position=position, width_heading=heading)
+    return {"net": net, "sga": SGAConfig(), "q": QConfig(), "maze": maze}
 
 
-def _paper(agent: str, network: str) -> Config:
+def _paper(agent: str) -> dict[str, Any]:
     """Every number as printed; where the paper is silent, the reading of docs/paper.md."""
-    net = NetworkConfig(theta=0.5)
-    sga_settings = SGAConfig(
+    sga = SGAConfig(
         trace_decay=1.0,
         baseline="constant",
         rate_mean=0.05,
@@ -46,7 +42,7 @@ def _paper(agent: str, network: str) -> Config:
         value_limit=None,
         replays=0,
     )
-    q_settings = QConfig(
+    q = QConfig(
         coding="antecedent",
         trace_decay=0.0,
         trace_cut=False,
@@ -60,13 +56,11 @@ def _paper(agent: str, network: str) -> Config:
         initial=0.0,
         replays=0,
     )
-    rewards = (1.0, -1e-4) if agent == "sga" else (100.0, -0.1)
+    goal, collision = (100.0, -0.1) if agent == "q" else (1.0, -1e-4)
     maze = MazeConfig(
         dead_reckoning="literal",
-        goal_reward=rewards[0],
-        collision_reward=rewards[1],
+        goal_reward=goal,
+        collision_reward=collision,
         subgoal_reward=0.5,
     )
-    return Config(
-        agent, network, preset="paper", net=net, sga=sga_settings, q=q_settings, maze=maze
-    )
+    return {"net": NetworkConfig(theta=0.5), "sga": sga, "q": q, "maze": maze}

@@ -5,40 +5,44 @@ import dataclasses
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
 
+from sofnn_torch.bounds import Count, Settings, Within
+from sofnn_torch.learners.learner import Learner
 from sofnn_torch.maze.env import KheperaMazeEnv
 from sofnn_torch.runs import checkpoint
 from sofnn_torch.runs.checkpoint import CheckpointError
 from sofnn_torch.runs.directory import Run, load_config, same_settings
-from sofnn_torch.runs.factory import Agent, make_agent, make_env
+from sofnn_torch.runs.factory import make_agent, make_env
 from sofnn_torch.runs.settings import Config, from_dict
 from sofnn_torch.runs.trial import TrialRecord
 
 LARGE_BLOCK = 2**25 - 2**14  # bytes; just below the largest block that glibc learns to keep
+MOST_THREADS = 256  # beyond some number a system starts no more, and the process dies of it
+LONGEST_NAME = 200  # bytes; file systems allow 255, and a name gets additions
 WINDOW = 10  # trials that decide which checkpoint is the best
 
 
 @dataclass(frozen=True)
-class RunOptions:
+class RunOptions(Settings):
     """How a run is kept and shown; nothing here but `threads` changes what is learned."""
 
     runs: Path = Path("runs")
     """Directory of all runs."""
     name: str | None = None
     """Name of the run's directory; by default made from agent, network, pose and seed."""
-    checkpoint_every: int = 5
+    checkpoint_every: Count = 5
     """Trials from one checkpoint to the next."""
-    keep: int = 3
+    keep: Count = 3
     """Checkpoints that are kept, beside the best one."""
-    picture_every: int = 25
+    picture_every: Annotated[int, Within(least=0)] = 25
     """Trials from one set of TensorBoard pictures to the next; 0 for none."""
-    video_every: int = 50
+    video_every: Annotated[int, Within(least=0)] = 50
     """Trials from one TensorBoard video to the next; 0 for none."""
-    threads: int = 1
+    threads: Annotated[Count, Within(most=MOST_THREADS)] = 1
     """Threads of torch; one is fastest at this size. Results with replay or with several thousand
     rules differ in their last bits between one and more."""
     quiet: bool = False
@@ -46,12 +50,7 @@ class RunOptions:
 
     def __post_init__(self) -> None:
         """Check the numbers; ValueError names the flag."""
-        for name, least in LEAST.items():
-            if getattr(self, name) < least:
-                flag = f"--{name}".replace("_", "-")
-                raise ValueError(f"{flag} must be at least {least}, got {getattr(self, name)}")
-        if self.threads > MOST_THREADS:
-            raise ValueError(f"--threads must be at most {MOST_THREADS}, got {self.threads}")
+        super().__post_init__()
         name = self.name
         if name is None:
             return
@@ -61,17 +60,12 @@ class RunOptions:
             raise ValueError(f"--name must have at most {LONGEST_NAME} bytes, got {name[:40]}...")
 
 
-LEAST = {"checkpoint_every": 1, "keep": 1, "picture_every": 0, "video_every": 0, "threads": 1}
-MOST_THREADS = 256  # beyond some number a system starts no more, and the process dies of it
-LONGEST_NAME = 200  # bytes; file systems allow 255, and a name gets additions
-
-
 @dataclass
 class Session:
     """Directory, learner and maze of a run, and its state after the last whole trial."""
 
     run: Run
-    agent: Agent
+    agent: Learner
     env: KheperaMazeEnv
     state: dict[str, Any]
 
@@ -188,7 +182,7 @@ def reopen(path: Path, options: RunOptions, trials: int | None = None) -> Sessio
         return Session(run, agent, env, state)
 
 
-def build(config: Config) -> tuple[Agent, KheperaMazeEnv]:
+def build(config: Config) -> tuple[Learner, KheperaMazeEnv]:
     """Learner and maze with their own random numbers.
 
     Raises:
@@ -241,6 +235,6 @@ def _choose(home: Path, path: Path, config: Config) -> tuple[Path | None, dict[s
     return file, state
 
 
-def _first_state(config: Config, agent: Agent, env: KheperaMazeEnv) -> dict[str, Any]:
+def _first_state(config: Config, agent: Learner, env: KheperaMazeEnv) -> dict[str, Any]:
     counters = {"trial": 0, "total_steps": 0, "recent": [], "best": []}
     return {"config": dataclasses.asdict(config)} | counters | checkpoint.snapshot(agent, env)

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from sofnn_torch.bounds import Count, Settings
 from sofnn_torch.maze.optimum import optimal_steps
 from sofnn_torch.maze.robot import Physics
 from sofnn_torch.runs import parallel
@@ -24,7 +25,7 @@ from sofnn_torch.terminal import output, parse, say
 
 
 @dataclass(frozen=True)
-class Options:
+class Options(Settings):
     """Run studies, or only write their tables and figures anew."""
 
     study: tuple[Literal["section5", "paper", "growth", "ablation", "fixed", "robustness"], ...] = (
@@ -35,11 +36,11 @@ class Options:
     """Only the arms whose name contains this text, e.g. `sofnn` or `q-no`."""
     seeds: str | None = None
     """Seeds of every arm, such as `0-9` (the default) or `0,3,5`."""
-    workers: int = 2
+    workers: Count = 2
     """Runs at the same time, each in a process of its own on one core."""
-    trials: int | None = None
+    trials: Count | None = None
     """Trials of every run; by default those of the presets."""
-    max_steps: int | None = None
+    max_steps: Count | None = None
     """Steps after which a trial ends; by default those of the presets."""
     out: Path | None = None
     """Where data, tables and figures go; by default docs/results."""
@@ -50,13 +51,6 @@ class Options:
     below runs/quick. The numbers mean nothing."""
     report_only: bool = False
     """Run nothing: tables and figures from the data that is there."""
-
-    def __post_init__(self) -> None:
-        """Check the numbers; ValueError names the flag."""
-        for name in ("workers", "trials", "max_steps"):
-            value = getattr(self, name)
-            if value is not None and value < 1:
-                raise ValueError(f"--{name.replace('_', '-')} must be at least 1, got {value}")
 
 
 def complete(options: Options) -> Options:

@@ -64,7 +64,7 @@ def under_conditions(path: Path) -> list[dict[str, Any]]:
                 seed = 2000 + config.seed
                 env = changed_maze(config, change, seed)
                 env.reset(seed=seed)
-                agent.rng = np.random.default_rng(seed)
+                agent.reseed(seed)
                 records = [
                     play(env, agent, learn=False, explore=policy == "sampled")[0]
                     for _ in range(EPISODES)

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from sofnn_torch.runs.directory import flatten
-from sofnn_torch.runs.presets import preset
 from sofnn_torch.runs.settings import Config, from_dict
 
 Arm = dict[str, Any]
@@ -95,7 +94,7 @@ HELPS: dict[str, dict[str, Arm]] = {
         "adapt-centres-widths": _adapt("sga"),
         "adapt-slowly": _adapt("sga", SLOWLY),
         "subgoal-reward": {"maze.subgoal_reward": 0.5},
-        "action-steer": {"sga.actions": "steer"},
+        "action-steer": {"maze.actions": "steer"},
     },
     "q": {
         "no-replay": {"q.replays": 0},
@@ -212,7 +211,7 @@ def settings(arm: Arm, seed: int = 0, **changes: Any) -> Config:
     """
     arm = arm | changes
     agent, network = arm.pop("agent"), arm.pop("network", "sofnn")
-    config = preset(agent, network, arm.pop("preset", "default"))
+    config = Config(agent=agent, network=network, preset=arm.pop("preset", "default"))
     tables: dict[str, Arm] = {}
     for name, value in arm.items():
         table, _, entry = name.rpartition(".")

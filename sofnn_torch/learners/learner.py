@@ -1,0 +1,313 @@
+"""What every learner is: one decision after another, on one network, for one task.
+
+SGA and Q-learning differ in how they choose an action and in the error that they learn from. All
+else stands here once: the order of a decision, memory, chance, state, and what evaluation, rules,
+pictures and studies ask of a learner.
+"""
+
+import math
+from abc import ABC, abstractmethod
+from collections import defaultdict
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from sofnn_torch.bounds import Settings
+from sofnn_torch.learners.memory import ReplayMemory
+from sofnn_torch.network.axes import Axis
+from sofnn_torch.network.sofnn import SOFNN
+
+CHUNK = 512  # states at a time: memory stays near CHUNK x rules numbers
+
+Action = int | NDArray[np.float32]
+Layout = tuple[tuple[Axis, ...], tuple["Output", ...]]
+
+
+@dataclass(frozen=True)
+class Task:
+    """What is learned: the axes of the state, and the actions.
+
+    Args:
+        axes: of the n numbers of a state.
+        actions: names of the actions to choose among, or of the numbers that make an action.
+        discrete: choose one of the actions; otherwise each is a number in [-1, 1].
+        wheels: wheel speeds of a scalar action of a robot, over the fastest (for the coding
+            ``wheels`` of Q-learning).
+    """
+
+    axes: tuple[Axis, ...]
+    actions: tuple[str, ...]
+    discrete: bool
+    wheels: Callable[[float], list[float]] | None = None
+
+
+@dataclass(frozen=True)
+class Output:
+    """One consequent of every rule.
+
+    Args:
+        name: as in words and rule files.
+        initial: of a new rule.
+        low: the least value that learning leaves it.
+        high: the greatest.
+        interpolates: a network that interpolates gives a new rule its present output instead.
+    """
+
+    name: str
+    initial: float = 0.0
+    low: float = -math.inf
+    high: float = math.inf
+    interpolates: bool = True
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a learner would do at B states, without exploration.
+
+    Attributes:
+        actions: as `Learner.act` gives them: numbers of the actions (B,), or vectors (B, m).
+        choice: number of the action among `Learner.choices`; None without choices. Shape: (B,).
+        value: what the learner expects from there; None if it keeps no value. Shape: (B,).
+    """
+
+    actions: NDArray[Any]
+    choice: NDArray[np.int64] | None
+    value: NDArray[np.float64] | None
+
+
+class Learner(ABC):
+    """A learner on a fuzzy network.
+
+    The calling loop, of a simulator or of a robot:
+
+        action = learner.start(observation)
+        while action is not None:
+            observation, reward, terminated, truncated, _ = env.step(action)
+            action = learner.step(reward, observation, terminated, truncated)
+
+    A learner of one's own has settings, a `layout`, and the four methods `_choose`, `_error`,
+    `_learn` and `_policy`, and `act`. Where ``agent`` is ``module:Class``, everything finds it.
+
+    Attributes:
+        name: what settings call it.
+        greedy: what its actions without exploration are called.
+        Settings: class of its settings.
+        choices: names of the actions that it chooses among; none if actions are vectors.
+        value: what it expected at the last decision.
+
+    Args:
+        net: the network, as `layout` says.
+        task: what is learned.
+        settings: an object of the class `Settings`.
+        seed: of its chance.
+
+    Raises:
+        ValueError: the network has other inputs or outputs than the layout.
+    """
+
+    name: ClassVar[str]
+    greedy: ClassVar[str] = "greedy"
+    Settings: ClassVar[type[Settings]]
+
+    def __init__(self, net: SOFNN, task: Task, settings: Any, seed: int = 0):
+        self.inputs, self.outputs = self.layout(settings, task)
+        wanted, found = (len(self.inputs), len(self.outputs)), (net.n_inputs, net.n_outputs)
+        if wanted != found:
+            raise ValueError(
+                f"{type(self).__name__} needs a network with {wanted[0]} inputs and {wanted[1]} "
+                f"outputs, this one has {found[0]} and {found[1]}"
+            )
+        self.net, self.task, self.settings = net, task, settings
+        self.choices: tuple[str, ...] = task.actions if task.discrete else ()
+        self.memory: ReplayMemory | None = None
+        self.decision: list[float] = []  # what the memory keeps of the last decision
+        self.value = 0.0
+        self._log: dict[str, list[float]] = defaultdict(list)
+        self.reseed(seed)
+
+    # ------------------------------------------------------------------------------- learning
+
+    def start(self, observation: NDArray[Any]) -> Action:
+        """Begin a trial at the observation (n,): clear the traces, choose the first action."""
+        self.net.traces.zero_()
+        if self.memory:
+            self._replay(self.memory)
+        x = self._tensor(observation)
+        return self._choose(x, self._firing(x))
+
+    def step(
+        self,
+        reward: float,
+        observation: NDArray[Any],
+        terminated: bool,
+        truncated: bool = False,
+    ) -> Action | None:
+        """Learn from the reward of the last action, then choose the next (None at the end).
+
+        Args:
+            reward: reward of the last action.
+            observation: the state that it led to. Shape: (n,).
+            terminated: no state follows this one; its value is 0.
+            truncated: the trial ends here, but not the robot's way: the value of the state counts.
+        """
+        if self.memory is not None:
+            self.memory.add([*self.decision, reward, not terminated, *observation.tolist()])
+        if terminated:
+            self._learn(self._error(reward))
+            return None
+        x = self._tensor(observation)
+        firing = self._firing(x)
+        self._learn(self._error(reward, x, firing))
+        return None if truncated else self._choose(x, firing)
+
+    @abstractmethod
+    def act(self, observation: NDArray[Any], explore: float = 0) -> Action:
+        """What the learned policy does; learns nothing and adds no rule.
+
+        Args:
+            observation: the state. Shape: (n,).
+            explore: 0 for none, 1 as in learning, more for as many times more.
+        """
+
+    @classmethod
+    @abstractmethod
+    def layout(cls, settings: Any, task: Task) -> Layout:
+        """Axes of the network's inputs, the first of them those of the state, and its outputs.
+
+        Raises:
+            ValueError: the settings do not go with the task.
+        """
+
+    @abstractmethod
+    def _choose(self, x: Tensor, firing: Tensor) -> Action:
+        """Choose an action at the state x (n,) and prepare to learn from its reward."""
+
+    @abstractmethod
+    def _error(self, reward: float, x: Tensor | None = None, firing: Tensor | None = None) -> float:
+        """The error of a decision: its reward and the state after it; no state at the end."""
+
+    @abstractmethod
+    def _learn(self, error: float) -> None:
+        """Take a step for the error of the last decision."""
+
+    @abstractmethod
+    def _policy(self, x: Tensor) -> tuple[Tensor, Tensor | None]:
+        """At states (B, n): actions (B, m), or numbers among `choices` (B,), and values (B,)."""
+
+    def _replay(self, memory: ReplayMemory) -> None:  # noqa: B027, not all learners do
+        """Learn again from remembered decisions, at the beginning of a trial."""
+
+    def _firing(self, x: Tensor) -> Tensor:
+        """Let the network grow at a state (n,); its normalised firing there."""
+        return self.net.observe(x)
+
+    # ------------------------------------------------------------------------------ questions
+
+    @torch.no_grad()
+    def plan(self, states: NDArray[Any]) -> Plan:
+        """What the learner would do at states (B, n); nothing is learned and nothing drawn."""
+        x = self._tensor(np.asarray(states))
+        actions, values = zip(*map(self._policy, x.tensor_split(1 + len(x) // CHUNK)), strict=True)
+        found = torch.cat(actions).numpy()
+        value = None if values[0] is None else torch.cat(values).double().numpy()
+        return Plan(self._commands(found), found if self.choices else None, value)
+
+    @torch.no_grad()
+    def firing(self, observation: NDArray[Any]) -> Tensor:
+        """Normalised firing at a state (n,): a row, or one for each action. Shape: (.., K)."""
+        inputs = self.network_inputs(self._tensor(observation))
+        return self.net.normalised_firing(inputs.reshape(-1, inputs.shape[-1]))
+
+    def strongest_rule(self, observation: NDArray[Any]) -> int:
+        """The rule that fires most at the state (n,)."""
+        return int(self.firing(observation).argmax()) % self.net.n_rules
+
+    @torch.no_grad()
+    def usage(self, states: NDArray[Any]) -> NDArray[np.float64]:
+        """Mean normalised firing of each rule (K,) along a trial, from its states (T, n)."""
+        inputs = self.network_inputs(self._tensor(np.asarray(states))).reshape(-1, len(self.inputs))
+        parts = inputs.split(CHUNK)
+        total = sum(self.net.normalised_firing(part).sum(0) for part in parts)
+        return (total / len(inputs)).double().numpy()
+
+    def conclusions(self, x: Tensor) -> tuple[list[str], NDArray[np.float64]]:
+        """What each rule concludes by itself: names (c,) and numbers (K, c).
+
+        Args:
+            x: where, one state for all rules or the inputs of one each. Shape: (n,) or (K, n).
+        """
+        return [output.name for output in self.outputs], self.net.consequents.double().numpy()
+
+    def alone(self, conclusions: NDArray[np.float64]) -> NDArray[np.int64] | None:
+        """The action that each rule would choose by its `conclusions` (K, c) alone. Shape: (K,).
+
+        None where actions are vectors, or each rule is about one action; -1 for a rule that is
+        undecided.
+        """
+        return None
+
+    def network_inputs(self, x: Tensor) -> Tensor:
+        """Inputs of the network at states (.., n): these, or with every action (.., J, n + 1)."""
+        return x
+
+    def statistics(self) -> dict[str, float]:
+        """Means over the decisions since the last call (docs/metrics.md); starts afresh."""
+        log, self._log = self._log, defaultdict(list)
+        if not log["firing"]:
+            return {}
+        error = torch.tensor(log["error"] or [0.0])
+        return (
+            self._summary(log)
+            | {"learning/error_rms": error.square().mean().sqrt().item()}
+            | self.net.statistics(log["firing"])
+        )
+
+    def _summary(self, log: dict[str, list[float]]) -> dict[str, float]:
+        """The learner's own part of the `statistics`, from what it logged."""
+        return {}
+
+    # ------------------------------------------------------------------------- chance and state
+
+    def reseed(self, seed: int | np.random.SeedSequence) -> None:
+        """Begin the learner's chance anew."""
+        self.rng = np.random.default_rng(seed)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that the future depends on, as tensors, numbers and text."""
+        state = {
+            "net": self.net.state_dict(),
+            "rng": self.rng.bit_generator.state,
+            "value": self.value,
+        }
+        return state if self.memory is None else state | {"memory": self.memory.state_dict()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Counterpart of `state_dict`; a fresh learner takes the size of the stored network."""
+        self.net.load_state_dict(state["net"])
+        self.rng.bit_generator.state = state["rng"]
+        self.value = state["value"]
+        if self.memory is not None:
+            self.memory.load_state_dict(state["memory"])
+
+    def _remember(self, fields: dict[str, int], capacity: int) -> None:
+        """Keep a memory of decisions with these fields, and what they led to."""
+        dtype = self.net.default_width.cpu().numpy().dtype
+        after = {"reward": 0, "continues": 0, "next_state": len(self.task.axes)}
+        self.memory = ReplayMemory(fields | after, capacity, dtype)
+
+    def _tensor(self, values: NDArray[Any]) -> Tensor:
+        return torch.from_numpy(values).to(self.net.default_width)
+
+    def _commands(self, found: NDArray[Any]) -> NDArray[Any]:
+        """Actions for the environment from what `_policy` found."""
+        return found
+
+
+def column(net: SOFNN, rates: list[float]) -> Tensor:
+    """Learning rates, one for each row of the network's table. Shape: (rows, 1)."""
+    return net.default_width.new_tensor(rates)[:, None]
