@@ -23,10 +23,11 @@ from timing import arguments, interleaved, median, ratio, report
 from torch import Tensor
 
 from sofnn_torch.learners.learner import Learner
+from sofnn_torch.maze.settings import POSE
 from sofnn_torch.network.sofnn import SOFNN
 from sofnn_torch.runs.factory import make_agent
 from sofnn_torch.runs.session import arithmetic
-from sofnn_torch.runs.settings import POSE, Config
+from sofnn_torch.runs.settings import Config
 
 SIZES = (1_000, 10_000)
 GROWTH = (10, 30, 100, 300, 1_000, 3_000, 10_000, 30_000, 100_000)

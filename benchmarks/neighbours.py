@@ -20,9 +20,10 @@ from learning import fill, states
 from timing import arguments, interleaved, median, ratio, report
 from torch import Tensor
 
+from sofnn_torch.maze.settings import POSE
 from sofnn_torch.network.sofnn import SOFNN
 from sofnn_torch.runs.session import arithmetic
-from sofnn_torch.runs.settings import POSE, Config
+from sofnn_torch.runs.settings import Config
 
 SIZES = (1_000, 10_000, 100_000)
 REACHES = (4.0, 7.0)  # widths

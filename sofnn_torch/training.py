@@ -6,30 +6,33 @@ numbers. So nothing that is learned or logged depends on when a run was interrup
 """
 
 import dataclasses
-import math
 import time
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from tqdm import tqdm
 
 from sofnn_torch.learners.frozen import FrozenPolicy
 from sofnn_torch.learners.learner import Learner
+from sofnn_torch.maze.env import KheperaMazeEnv
 from sofnn_torch.pictures.tensorboard import Monitor
 from sofnn_torch.runs import checkpoint, session
-from sofnn_torch.runs.guard import Divergence, diagnose, physics_warnings
+from sofnn_torch.runs.guard import Divergence, Watch
 from sofnn_torch.runs.session import RunOptions, Session, arithmetic, environment_seed
 from sofnn_torch.runs.settings import Config, from_dict
 from sofnn_torch.runs.signals import Interrupted, SignalTrap
-from sofnn_torch.runs.trial import Trajectory, TrialRecord
+from sofnn_torch.runs.trial import Recorder, Trajectory, TrialRecord
 from sofnn_torch.terminal import plural, say
 
 __all__ = ["RunOptions", "environment_seed", "play", "replay", "resume", "train"]
 
 
 def play(
-    env, agent: Learner, learn: bool = True, explore: bool = True, trap: SignalTrap | None = None
+    env: KheperaMazeEnv,
+    agent: Learner,
+    learn: bool = True,
+    explore: bool = True,
+    trap: SignalTrap | None = None,
 ) -> tuple[TrialRecord, Trajectory]:
     """One trial from the start to the goal or the trial's limit.
 
@@ -47,57 +50,20 @@ def play(
         Interrupted: a signal came; the agent is in the middle of a trial then.
         Divergence: the agent, the observation or the physics diverged.
     """
-    trap, policy = trap or SignalTrap(), FrozenPolicy(agent, explore)
+    policy = agent if learn else FrozenPolicy(agent, explore)
     observation, info = env.reset()
-    true, estimated = [info["true_pose"]], [info["estimated_pose"]]
-    total = collisions = decisions = 0
-    over = False
-    try:
-        action = agent.start(observation) if learn else policy.act(observation)
-        while not over:
-            if trap.number:
+    recorder = Recorder(info)
+    with Watch(agent, env, observation) as watch:
+        action = policy.start(observation)
+        while action is not None:
+            if trap and trap.number:
                 raise Interrupted(trap.number)
             observation, reward, terminated, truncated, info = env.step(action)
-            over = terminated or truncated
-            if learn:
-                action = agent.step(reward, observation, terminated, truncated)
-            elif not over:
-                action = policy.act(observation)
-            total += reward
-            decisions += 1
-            collisions += info["collision"]
-            true.append(info["true_pose"])
-            estimated.append(info["estimated_pose"])
-            # One sum stands for all: it is not finite if any of its terms is not.
-            if not math.isfinite(sum(observation.tolist(), reward + agent.value)):
-                raise Divergence(diagnose(agent, observation) or "a value estimate is not finite")
-    except (ArithmeticError, RuntimeError, ValueError, StopIteration) as error:
-        # Code that meets a NaN fails in its own ways; what matters is where the NaN is.
-        if not isinstance(error, Divergence) and (what := diagnose(agent, observation)):
-            raise Divergence(what) from error
-        raise
-    if what := physics_warnings(env) or (diagnose(agent, observation) if learn else ""):
-        raise Divergence(what)
-    path = Trajectory(np.array(true), np.array(estimated))
-    difference = path.true - path.estimated
-    distance = np.hypot(difference[:, 0], difference[:, 1])
-    turn = np.abs((difference[:, 2] + math.pi) % (2 * math.pi) - math.pi)
-    record = TrialRecord(
-        trial=0,
-        steps=info["total_steps"],
-        decisions=decisions,
-        total_steps=info["total_steps"],
-        reward=float(total),
-        success=bool(info["success"]),
-        collisions=int(collisions),
-        subgoals=sum(map(bool, info["subgoals"])),
-        rules=agent.net.n_rules,
-        pose_error=float(distance[1:].mean()),
-        pose_error_max=float(distance[1:].max()),
-        heading_error=float(turn[1:].mean()),
-        statistics=agent.statistics() if learn else {},
-    )
-    return record, path
+            watch.observation = observation
+            action = policy.step(reward, observation, terminated, truncated)
+            recorder.add(reward, info)
+            watch.check(reward)
+    return recorder.finish(env, agent, agent.statistics() if learn else {})
 
 
 def train(config: Config, options: RunOptions | None = None) -> Path:

@@ -15,8 +15,8 @@ import learning
 import neighbours
 import training
 
+from sofnn_torch.maze.settings import POSE
 from sofnn_torch.network.sofnn import SOFNN
-from sofnn_torch.runs.settings import POSE
 
 
 def test_training_is_measured_for_both_learners_and_both_physics(tmp_path, monkeypatch, capsys):

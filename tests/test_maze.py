@@ -1,34 +1,19 @@
 """The maze as a Gymnasium environment."""
 
 import io
-import itertools
 import math
-import warnings
 
 import gymnasium
+import mujoco
 import numpy as np
 import pytest
 import torch
-from gymnasium.utils.env_checker import check_env
 
 from sofnn_torch.maze.env import LEFT, RIGHT, STRAIGHT, KheperaMazeEnv
-
-
-@pytest.mark.parametrize(
-    ("actions", "pose", "options"),
-    [
-        *itertools.product(("three", "steer", "wheels"), ("estimated", "odometry", "true"), ({},)),
-        ("three", "estimated", {"range_sensors": True}),
-        ("three", "estimated", {"dead_reckoning": "literal", "wheel_noise": "independent"}),
-    ],
-)
-def test_gymnasium_accepts_the_environment(actions, pose, options):
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        env = gymnasium.make(
-            "sofnn_torch:KheperaMaze-v0", actions=actions, pose=pose, **options
-        ).unwrapped
-        check_env(env, skip_render_check=True)
+from sofnn_torch.maze.odometry import FORWARD_SPEED
+from sofnn_torch.maze.robot import default_model_path
+from sofnn_torch.runs.factory import make_env
+from sofnn_torch.runs.settings import Config
 
 
 def rollout(env, seed, decisions=60):
@@ -54,24 +39,6 @@ def test_observing_ranges_does_not_disturb_the_robot():
     actions = np.random.default_rng(7).integers(3, size=60)
     seen = np.array([env.step(action)[0][:3] for action in actions])
     np.testing.assert_array_equal(seen, [step[0] for step in plain])
-
-
-@pytest.mark.parametrize("pose", ["estimated", "odometry", "true"])
-def test_observations_are_finite_not_aliased_and_change(pose):
-    env = KheperaMazeEnv(pose=pose, range_sensors=True)
-    observation, _ = env.reset(seed=0)
-    env.action_space.seed(0)
-    kept, copies = [observation], [observation.copy()]
-    for _ in range(1000):
-        observation, reward, terminated, truncated, _ = env.step(env.action_space.sample())
-        assert np.isfinite(observation).all() and math.isfinite(reward)
-        assert observation in env.observation_space
-        kept.append(observation)
-        copies.append(observation.copy())
-        if terminated or truncated:
-            env.reset()
-    np.testing.assert_array_equal(kept, copies)
-    assert (np.ptp(copies, axis=0) > 0.01).all()
 
 
 def test_20000_random_steps_stay_sound():
@@ -129,7 +96,7 @@ def test_a_trial_that_reaches_the_goal_in_its_last_step_is_not_cut_off():
 @pytest.fixture
 def bumping(monkeypatch):
     """A maze whose robot feels a wall before it in every step, also where none is."""
-    env = KheperaMazeEnv(motor_noise=0.0, collision_reward=-0.5)
+    env = KheperaMazeEnv(motor_noise=0.0, collision_reward=-0.5, subgoal_reward=0.25)
     env.reset(seed=0)
     monkeypatch.setattr(env.physics, "bumped", lambda: True)
     monkeypatch.setattr(env.physics, "wall_bearings", lambda: [0.0])
@@ -146,7 +113,7 @@ def test_the_goal_counts_also_with_a_bump(bumping):
 def test_landmarks_count_also_with_a_bump(bumping):
     bumping.physics.place((*bumping.plan.subgoals[0], 0.0))
     _, reward, _, _, info = bumping.step(LEFT)
-    assert info["subgoals"] == (True, False) and reward == 0.5 - 0.5
+    assert info["subgoals"].tolist() == [1, 0] and reward == 0.25 - 0.5
     np.testing.assert_array_equal(info["estimated_pose"], info["true_pose"])
 
 
@@ -163,15 +130,15 @@ def test_a_bump_ends_the_decision():
 
 
 def test_a_subgoal_pays_once_a_trial():
-    env = KheperaMazeEnv(motor_noise=0.0)
+    env = KheperaMazeEnv(motor_noise=0.0, subgoal_reward=0.5)
     x, y = env.plan.subgoals[0]
     away = (x - 0.1, y - 0.1, 0.25 * math.pi)
     for _ in range(2):
         env.reset(options={"pose": away})
         _, reward, _, _, info = env.step(STRAIGHT)
-        assert info["subgoals"] == (False, False) and reward == 0.0
+        assert not info["subgoals"].any() and reward == 0.0
         _, reward, _, _, info = env.step(STRAIGHT)
-        assert info["subgoals"] == (True, False) and reward == 0.5
+        assert info["subgoals"].tolist() == [1, 0] and reward == 0.5
         env.physics.place(away)
         rewards = [env.step(STRAIGHT)[1] for _ in range(3)]
         assert rewards == [0.0, 0.0, 0.0]
@@ -239,13 +206,13 @@ def test_a_restored_state_has_the_same_future(pose):
 
 
 def test_a_restored_trial_knows_the_subgoals_it_has_found():
-    env, other = KheperaMazeEnv(), KheperaMazeEnv()
+    env, other = (KheperaMazeEnv(subgoal_reward=0.5) for _ in range(2))
     env.reset(seed=0)
     env.physics.place((*env.plan.subgoals[1], 0.0))
     assert env.step(LEFT)[1] == 0.5
     other.load_state_dict(env.state_dict())
     _, reward, _, _, info = other.step(LEFT)
-    assert info["subgoals"] == (False, True) and reward == 0.0
+    assert info["subgoals"].tolist() == [0, 1] and reward == 0.0
 
 
 def test_a_restored_trial_that_was_over_is_over():
@@ -259,27 +226,80 @@ def test_a_restored_trial_that_was_over_is_over():
 
 
 @pytest.mark.parametrize(
-    "options",
+    ("name", "values"),
     [
-        {"pose": "gps"},
-        {"actions": "four"},
-        {"hold": 0},
-        {"hold": 2.5},
-        {"max_steps": 0},
-        {"motor_noise": 1.0},
-        {"motor_noise": math.nan},
-        {"wheel_noise": "pink"},
-        {"dead_reckoning": "perfect"},
-        {"goal_reward": math.nan},
-        {"wheel_radius_scale": 0.0},
-        {"wheel_base_scale": math.inf},
-        {"render_mode": "ansi"},
-        {"model_path": "no/such/file.xml"},
+        ("pose", ["gps", None, 1, ["true"], np.array(["true", "estimated"])]),
+        ("actions", ["four", None, 3]),
+        ("hold", [0, 2.5, -1, math.inf, math.nan, None, "10", True, 10_001, np.array([10, 10])]),
+        ("max_steps", [0, 2.5, math.inf, -math.inf, math.nan, None, "10", True, 2**63, 10**400]),
+        ("motor_noise", [1.0, -0.1, math.nan, math.inf, None, "0.1", True, np.array([0.1, 0.2])]),
+        ("wheel_noise", ["pink", None, 1]),
+        ("dead_reckoning", ["perfect", None, 1]),
+        *((f"{part}_reward", [math.nan, math.inf, None, "1", True, 1j, 10**400])
+          for part in ("goal", "collision", "subgoal", "step")),
+        *((f"wheel_{part}_scale", [0.0, -1, math.inf, math.nan, None, "1", True])
+          for part in ("radius", "base")),
+        ("range_sensors", [None, 1, "yes", np.array([True, False])]),
+        ("render_mode", ["ansi", 1, np.array(["human"])]),
+        ("model_path", ["no/such/file.xml", 5, b"maze.xml", [], __file__]),
+        ("camera", ["side", None, 0]),
+        ("width", [0, -1, 2.5, 9000, None, "480", math.nan]),
+        ("height", [0, -1, 2.5, 9000, None, "480", math.nan]),
+    ],
+)  # fmt: skip
+def test_impossible_settings_are_refused_in_one_line_that_names_them(name, values):
+    for value in values:
+        with pytest.raises(ValueError, match=name if name != "model_path" else "MJCF") as error:
+            KheperaMazeEnv(**{name: value})
+        assert "\n" not in str(error.value) and len(str(error.value)) < 200, value
+
+
+def test_scalars_of_numpy_are_taken_as_numbers():
+    env = KheperaMazeEnv(
+        actions=np.str_("steer"),
+        hold=np.int64(5),
+        max_steps=np.float64(50.0),
+        motor_noise=np.float32(0.0),
+        goal_reward=np.int8(3),
+        wheel_base_scale=np.float32(1.0),
+        range_sensors=np.True_,
+        width=np.int32(64),
+    )
+    env.reset(seed=0)
+    observation, reward, _, _, info = env.step([0.0])
+    assert observation.shape == (12,) and info["steps"] == 5 and reward == 0.0
+    numbers = (env.hold, env.max_steps, env.noise.magnitude, env.goal_reward, env.width)
+    assert [type(number) for number in numbers] == [int, int, float, float, int]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda spec: spec.delete(spec.site("goal")), "goal"),
+        (lambda spec: spec.delete(spec.sensor("ir_left_0")), "ir_left_0"),
+        (lambda spec: spec.delete(spec.key("start")), "start"),
+        (lambda spec: [spec.delete(geom) for geom in spec.geoms if "wall" in geom.name], "wall"),
     ],
 )
-def test_impossible_settings_are_refused(options):
-    with pytest.raises(ValueError, match=str(next(iter(options.values())))):
-        KheperaMazeEnv(**options)
+def test_a_model_that_lacks_an_element_is_refused(change, message, tmp_path):
+    spec = mujoco.MjSpec.from_file(str(default_model_path()))
+    change(spec)
+    path = tmp_path / "maze.xml"
+    path.write_text(spec.to_xml())
+    with pytest.raises(ValueError, match=f"lacks an element.*{message}") as error:
+        KheperaMazeEnv(model_path=path)
+    assert "\n" not in str(error.value) and len(str(error.value)) < 200
+
+
+def test_a_maze_without_subgoals_is_a_maze(tmp_path):
+    spec = mujoco.MjSpec.from_file(str(default_model_path()))
+    for name in ("subgoal_1", "subgoal_2"):
+        spec.delete(spec.site(name))
+    path = tmp_path / "maze.xml"
+    path.write_text(spec.to_xml())
+    env = KheperaMazeEnv(model_path=path)
+    env.reset(seed=0)
+    assert env.step(STRAIGHT)[4]["subgoals"].shape == (0,)
 
 
 @pytest.mark.parametrize(
@@ -290,6 +310,9 @@ def test_impossible_settings_are_refused(options):
         ({"pose": (1.5, 0.5, 0.0)}, "wall"),
         ({"pose": (0.5, math.nan, 0.0)}, "finite"),
         ({"pose": (0.5, 0.5)}, "three"),
+        ({"pose": None}, "three"),
+        ({"pose": ("0.5", "0.5", "0")}, "three"),
+        ({"pose": 0.5}, "three"),
     ],
 )
 def test_impossible_starts_are_refused(options, message):
@@ -297,12 +320,83 @@ def test_impossible_starts_are_refused(options, message):
         KheperaMazeEnv().reset(options=options)
 
 
+ODD = [None, "1", b"1", math.nan, math.inf, True, [True], 1j, {}, [[0], [1, 2]], object()]
+ODD += [[], [0, 1, 2], np.array([0, 1, 2]), torch.ones(1, requires_grad=True) * math.nan]
+
+
 @pytest.mark.parametrize(
-    ("actions", "action"),
-    [("three", 3), ("three", 0.5), ("steer", [1.5]), ("steer", [0, 0]), ("wheels", [math.nan, 0])],
+    ("actions", "odd"),
+    [
+        ("three", [3, -1, 0.5, 1.5, [0, 1], np.zeros(2), np.int64(3), 2**70]),
+        ("steer", [1.5, [-1.001], [0, 0], np.array([2.0]), 10**400]),
+        ("wheels", [0.5, [0.5], [math.nan, 0], [0, 1.5], ["0", "0"]]),
+    ],
 )
-def test_impossible_actions_are_refused(actions, action):
+def test_impossible_actions_are_refused_in_one_line_and_leave_the_trial_alone(actions, odd):
     env = KheperaMazeEnv(actions=actions)
-    env.reset()
-    with pytest.raises(ValueError, match="action must be"):
-        env.step(action)
+    env.reset(seed=0)
+    before = env.state_dict()
+    for action in odd + ODD:
+        with pytest.raises(ValueError, match="action must be") as error:
+            env.step(action)
+        assert "\n" not in str(error.value) and len(str(error.value)) < 150, action
+    assert env.state_dict() == before
+
+
+@pytest.mark.parametrize(
+    ("actions", "ways"),
+    [
+        ("three", [1, 1.0, np.int64(1), np.uint8(1), [1], np.array(1), np.array([1]),
+                   np.array([[1]]), torch.tensor(1), torch.tensor([1])]),
+        ("steer", [0, 0.0, [0], np.zeros(1), np.zeros((1, 1), np.float32), torch.zeros(1)]),
+        ("wheels", [[1, 1], (1.0, 1.0), np.ones(2), np.ones((1, 2)), torch.ones(2)]),
+    ],
+)  # fmt: skip
+def test_an_action_can_be_written_in_many_ways(actions, ways):
+    env = KheperaMazeEnv(actions=actions)
+    assert {env.wheel_speeds(way) for way in ways} == {(FORWARD_SPEED, FORWARD_SPEED)}
+
+
+def test_inputs_and_actions_have_names_and_ranges():
+    env = KheperaMazeEnv()
+    x, y, heading = env.axes
+    assert (x.name, x.unit, x.low, x.high, x.period) == ("x", "m", 0.0, 1.0, 0.0)
+    assert (y.name, y.unit, y.low, y.high, y.period) == ("y", "m", 0.0, 1.0, 0.0)
+    assert (heading.name, heading.unit) == ("heading", "rad")
+    assert (heading.low, heading.high, heading.period) == (-math.pi, math.pi, 2 * math.pi)
+    assert env.action_names[LEFT] == "left turn" and env.action_names[RIGHT] == "right turn"
+    assert env.action_names[STRAIGHT] == "straight"
+    assert KheperaMazeEnv(actions="steer").action_names == ("steer",)
+    assert KheperaMazeEnv(actions="wheels").action_names == ("left wheel", "right wheel")
+
+
+def test_the_ranges_are_those_of_the_plan(tmp_path):
+    spec = mujoco.MjSpec.from_file(str(default_model_path()))
+    spec.geom("wall_north").pos[1] += 0.5
+    path = tmp_path / "maze.xml"
+    path.write_text(spec.to_xml())
+    x, y, _ = KheperaMazeEnv(model_path=path).axes
+    assert (x.high, y.high) == (1.0, 1.5)
+
+
+def test_errors_are_measured_over_decisions_and_headings_the_short_way_round():
+    true = np.array([[0.0, 0.0, 0.0], [1.0, 1.0, 3.1], [2.0, 1.0, 0.5]])
+    estimated = np.array([[0.0, 0.0, 0.0], [1.0, 1.5, -3.1], [2.3, 1.4, 0.25]])
+    errors = KheperaMazeEnv().measure(true, estimated)
+    turn = 2 * math.pi - 6.2
+    assert errors == pytest.approx(
+        {"pose_error": 0.5, "pose_error_max": 0.5, "heading_error": (turn + 0.25) / 2}
+    )
+    worse = np.array([*estimated[:2], [2.0, 1.1, 0.5]])
+    assert KheperaMazeEnv().measure(true, worse)["pose_error_max"] == 0.5
+    assert KheperaMazeEnv().measure(true, worse)["pose_error"] == pytest.approx(0.3)
+
+
+def test_the_default_maze_is_the_one_that_training_uses():
+    made = gymnasium.make("sofnn_torch:KheperaMaze-v0").unwrapped
+    trained = make_env(Config()).unwrapped
+    names = "hold max_steps goal_reward collision_reward subgoal_reward step_reward pose_mode"
+    for name in [*names.split(), "wheel_radius_scale", "actions", "range_sensors", "plan"]:
+        assert getattr(made, name) == getattr(trained, name), name
+    assert vars(made.noise) == vars(trained.noise)
+    assert vars(made.estimator) == vars(trained.estimator)

@@ -1,10 +1,11 @@
 """A learned policy that plays a trial without learning, and does not run in circles."""
 
 from collections import Counter
+from typing import Any
 
-import numpy as np
+from numpy.typing import NDArray
 
-from sofnn_torch.learners.learner import Learner
+from sofnn_torch.learners.learner import Action, Learner
 
 PATIENCE = 4  # decisions at a rule that a sound way may need: a turn, a coarse grid
 MOST = 10  # doublings: by then every action is about as likely
@@ -29,7 +30,17 @@ class FrozenPolicy:
         self.agent, self.explore = agent, explore
         self.visits: Counter[int] = Counter()
 
-    def act(self, observation: np.ndarray) -> int | np.ndarray:
+    def start(self, observation: NDArray[Any]) -> Action:
+        """The first action of the trial."""
+        return self.act(observation)
+
+    def step(
+        self, reward: float, observation: NDArray[Any], terminated: bool, truncated: bool = False
+    ) -> Action | None:
+        """The next action, as `Learner.step`; None at the end."""
+        return None if terminated or truncated else self.act(observation)
+
+    def act(self, observation: NDArray[Any]) -> Action:
         """The action at an observation (n,)."""
         rule = self.agent.strongest_rule(observation)
         self.visits[rule] += 1

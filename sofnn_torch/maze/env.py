@@ -2,21 +2,33 @@
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import gymnasium
 import numpy as np
 
-from sofnn_torch.maze.odometry import STEP_SECONDS, WHEEL_BASE, DeadReckoning, MotorNoise, Pose
+from sofnn_torch.maze.arguments import choice, real, show, vector, whole
+from sofnn_torch.maze.odometry import (
+    FORWARD_SPEED,
+    STEP_SECONDS,
+    TURN_SPEED,
+    WHEEL_BASE,
+    DeadReckoning,
+    MotorNoise,
+    Pose,
+    pose_errors,
+)
 from sofnn_torch.maze.rendering import OffscreenRenderer, Viewer
 from sofnn_torch.maze.robot import INFRARED_RANGE, MazePlan, Physics, load_model
+from sofnn_torch.maze.settings import ACTION_NAMES, POSE, MazeConfig
+from sofnn_torch.network.axes import Axis
 
 __all__ = ["KheperaMazeEnv", "MazePlan", "Physics"]
 
-FORWARD_SPEED = 0.010  # m/s of both wheels: the paper's (10, 10) mm/s, 5 mm per step
-TURN_SPEED = 0.004  # m/s of each wheel: the paper's (-4, 4) mm/s, 0.08 rad per step
 RIGHT, STRAIGHT, LEFT = range(3)
+MAX_HOLD = 10_000  # steps; motor noise is drawn for a whole decision at once
 START, GOAL = -2, -1  # zones; the others are the numbers of sub-goals
 
 
@@ -44,18 +56,18 @@ class KheperaMazeEnv(gymnasium.Env[np.ndarray, Any]):
     def __init__(
         self,
         pose: str = "estimated",
-        actions: str = "three",
-        hold: int = 10,
-        max_steps: int = 20_000,
-        motor_noise: float = 0.1,
-        wheel_noise: str = "common",
-        dead_reckoning: str = "guarded",
-        goal_reward: float = 1.0,
-        collision_reward: float = -1e-4,
-        subgoal_reward: float = 0.5,
-        step_reward: float = 0.0,
-        wheel_radius_scale: float = 1.0,
-        wheel_base_scale: float = 1.0,
+        actions: str = MazeConfig.actions,
+        hold: int = MazeConfig.hold,
+        max_steps: int = MazeConfig.max_steps,
+        motor_noise: float = MazeConfig.motor_noise,
+        wheel_noise: str = MazeConfig.wheel_noise,
+        dead_reckoning: str = MazeConfig.dead_reckoning,
+        goal_reward: float = MazeConfig.goal_reward,
+        collision_reward: float = MazeConfig.collision_reward,
+        subgoal_reward: float = MazeConfig.subgoal_reward,
+        step_reward: float = MazeConfig.step_reward,
+        wheel_radius_scale: float = MazeConfig.wheel_radius_scale,
+        wheel_base_scale: float = MazeConfig.wheel_base_scale,
         range_sensors: bool = False,
         render_mode: str | None = None,
         model_path: str | Path | None = None,
@@ -89,32 +101,32 @@ class KheperaMazeEnv(gymnasium.Env[np.ndarray, Any]):
         Raises:
             ValueError: if a setting is unknown or out of range.
         """
-        _check_choice("pose", pose, ("estimated", "odometry", "true"))
-        _check_choice("actions", actions, ("three", "steer", "wheels"))
-        _check_choice("render_mode", render_mode, (None, *self.metadata["render_modes"]))
-        for name, count in (("hold", hold), ("max_steps", max_steps)):
-            if count < 1 or count != int(count):
-                raise ValueError(f"{name} must be a whole number of at least 1, not {count}")
+        pose = choice("pose", pose, ("estimated", "odometry", "true"))
+        actions = choice("actions", actions, tuple(ACTION_NAMES))
+        render_mode = choice("render_mode", render_mode, (None, *self.metadata["render_modes"]))
         for name, scale in (("radius", wheel_radius_scale), ("base", wheel_base_scale)):
-            if not 0.0 < scale < math.inf:
+            if real(f"wheel_{name}_scale", scale) <= 0.0:
                 raise ValueError(f"wheel_{name}_scale must be positive, not {scale}")
-        rewards = (goal_reward, collision_reward, subgoal_reward, step_reward)
-        if not all(map(math.isfinite, rewards)):
-            raise ValueError(f"rewards must be finite, not {rewards}")
+        if not isinstance(range_sensors, bool | np.bool_):
+            raise ValueError(f"range_sensors must be True or False, not {show(range_sensors)}")
 
         self.physics = Physics(model_path)
-        self.model_path, self.camera, self.width, self.height = model_path, camera, width, height
+        self.model_path = model_path
+        self.camera, self.width, self.height = self.physics.check_view(camera, width, height)
         self.plan = plan = self.physics.plan
         self.noise = MotorNoise(motor_noise, wheel_noise)
         self.estimator = DeadReckoning(
-            dead_reckoning, WHEEL_BASE * wheel_base_scale, self.plan.size
+            dead_reckoning, WHEEL_BASE * float(wheel_base_scale), self.plan.size
         )
         self.pose_mode, self.actions, self.render_mode = pose, actions, render_mode
-        self.hold, self.max_steps = int(hold), int(max_steps)
-        self.goal_reward, self.collision_reward = goal_reward, collision_reward
-        self.subgoal_reward, self.step_reward = subgoal_reward, step_reward
-        self.wheel_radius_scale = wheel_radius_scale
-        self.range_sensors = range_sensors
+        self.hold = whole("hold", hold, MAX_HOLD)
+        self.max_steps = whole("max_steps", max_steps)
+        self.goal_reward = real("goal_reward", goal_reward)
+        self.collision_reward = real("collision_reward", collision_reward)
+        self.subgoal_reward = real("subgoal_reward", subgoal_reward)
+        self.step_reward = real("step_reward", step_reward)
+        self.wheel_radius_scale = float(wheel_radius_scale)
+        self.range_sensors = bool(range_sensors)
         self.action_space = {
             "three": gymnasium.spaces.Discrete(3),
             "steer": gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float32),
@@ -180,14 +192,13 @@ class KheperaMazeEnv(gymnasium.Env[np.ndarray, Any]):
     def wheel_speeds(self, action: Any) -> tuple[float, float]:
         """Return the commanded speeds of the left and right wheel [m/s] for an action."""
         if self.actions == "three":
-            if action not in (RIGHT, STRAIGHT, LEFT):
-                raise ValueError(f"action must be 0 (right), 1 (straight), 2 (left), not {action}")
-            steer = int(action) - 1.0
+            (number,) = vector("action", action, 1)
+            if number not in (RIGHT, STRAIGHT, LEFT):
+                names = f"{RIGHT} (right), {STRAIGHT} (straight), {LEFT} (left turn)"
+                raise ValueError(f"action must be {names}, not {show(action)}")
+            steer = number - 1.0
         else:
-            values = np.asarray(action, dtype=np.float64).ravel().tolist()
-            size = self.action_space.shape[0]
-            if len(values) != size or not all(-1.0 <= value <= 1.0 for value in values):
-                raise ValueError(f"action must be {size} numbers in [-1, 1], not {action}")
+            values = vector("action", action, self.action_space.shape[0], bound=1.0)
             if self.actions == "wheels":
                 return values[0] * FORWARD_SPEED, values[1] * FORWARD_SPEED
             steer = values[0]
@@ -221,6 +232,29 @@ class KheperaMazeEnv(gymnasium.Env[np.ndarray, Any]):
         if self._renderer is not None:
             self._renderer.close()
             self._renderer = None
+
+    @property
+    def axes(self) -> tuple[Axis, ...]:
+        """What the first three observations are: x, y and heading, with their ranges."""
+        width, height = self.plan.size
+        x, y, heading = POSE
+        return replace(x, high=width), replace(y, high=height), heading
+
+    @property
+    def action_names(self) -> tuple[str, ...]:
+        """What the actions are called: one name for each choice, or for each number."""
+        return ACTION_NAMES[self.actions]
+
+    def measure(self, true: np.ndarray, estimated: np.ndarray) -> dict[str, float]:
+        """Return how far a trial's pose estimates were from the truth, see `pose_errors`."""
+        return pose_errors(true, estimated)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what a copy or a pickle takes along: all but the renderer and the callback.
+
+        A copy drives on like the original, and draws with a renderer of its own.
+        """
+        return self.__dict__ | {"_renderer": None, "on_simulator_step": None}
 
     def state_dict(self) -> dict[str, Any]:
         """Return the full state as plain numbers and lists; from it the future is bit-identical."""
@@ -298,7 +332,8 @@ class KheperaMazeEnv(gymnasium.Env[np.ndarray, Any]):
             "total_steps": self.total_steps,
             "collision": bumped,
             "success": success,
-            "subgoals": tuple(self.subgoals),
+            "is_success": success,  # the name that evaluation callbacks read
+            "subgoals": np.array(self.subgoals, dtype=np.int8),
             "true_pose": np.array(self.physics.pose()),
             "estimated_pose": np.array(self.estimator.pose),
         }
@@ -318,16 +353,9 @@ class KheperaMazeEnv(gymnasium.Env[np.ndarray, Any]):
         unknown = set(options) - {"pose"}
         if unknown:
             raise ValueError(f'unknown reset options {sorted(unknown)}: only "pose" is known')
-        pose = tuple(float(value) for value in options.get("pose", self.plan.start))
-        if len(pose) != 3 or not all(map(math.isfinite, pose)):
-            raise ValueError(f"the reset pose must be three finite numbers, not {pose}")
+        pose = tuple(vector("the reset pose", options.get("pose", self.plan.start), 3))
         width, height = self.plan.size
         inside = 0.0 < pose[0] < width and 0.0 < pose[1] < height
         if not inside or self.plan.clearance(pose[0], pose[1]) < 0.0:
             raise ValueError(f"the robot cannot be put at {pose[:2]}: a wall is there")
         return pose
-
-
-def _check_choice(name: str, value: Any, choices: tuple[Any, ...]) -> None:
-    if value not in choices:
-        raise ValueError(f"{name} must be one of {choices}, not {value!r}")

@@ -7,10 +7,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sofnn_torch.maze.arguments import choice, real
+
 STEP_SECONDS = 0.5
+FORWARD_SPEED = 0.010  # m/s of both wheels: the paper's (10, 10) mm/s
+TURN_SPEED = 0.004  # m/s of each wheel, in opposite directions: the paper's (-4, 4) mm/s
 WHEEL_BASE = 0.050  # m, distance between the wheels
 WHEEL_RADIUS = 0.008  # m
-TURN_SHARE = 0.4  # wheel speed of a turn over that of going straight: 4 mm/s of 10 mm/s
+STEP_LENGTH = FORWARD_SPEED * STEP_SECONDS  # m, one step straight on: 5 mm
+STEP_TURN = 2.0 * TURN_SPEED * STEP_SECONDS / WHEEL_BASE  # rad, one turning step: 0.08 rad
+TURN_SHARE = TURN_SPEED / FORWARD_SPEED  # wheel speed of a turn over that of going straight
 DRAG = 1.7  # sideways drag of the tyres over that of the drive, of the simulated robot
 
 Pose = tuple[float, float, float]
@@ -56,12 +62,10 @@ class MotorNoise:
         Raises:
             ValueError: if `magnitude` is outside [0, 1) or `kind` is unknown.
         """
-        if not 0.0 <= magnitude < 1.0:
+        self.magnitude = real("motor_noise", magnitude)
+        if not 0.0 <= self.magnitude < 1.0:
             raise ValueError(f"motor_noise must be in [0, 1), not {magnitude}")
-        if kind not in ("common", "independent"):
-            raise ValueError(f'wheel_noise must be "common" or "independent", not {kind!r}')
-        self.magnitude = magnitude
-        self.kind = kind
+        self.kind = choice("wheel_noise", kind, ("common", "independent"))
 
     def apply(self, left: float, right: float, first: float, second: float) -> tuple[float, float]:
         """Return noisy speeds from commanded ones and two draws from U(0, 1)."""
@@ -97,14 +101,11 @@ class DeadReckoning:
         Raises:
             ValueError: if `mode` is unknown or `wheel_base` is not positive.
         """
-        if mode not in ("guarded", "still", "literal"):
-            raise ValueError(
-                f'dead_reckoning must be "guarded", "still" or "literal", not {mode!r}'
-            )
-        if not wheel_base > 0.0:
+        mode = choice("dead_reckoning", mode, ("guarded", "still", "literal"))
+        self.wheel_base = real("wheel_base", wheel_base)
+        if not self.wheel_base > 0.0:
             raise ValueError(f"wheel_base must be positive, not {wheel_base}")
         self.guarded, self.slides = mode != "literal", mode == "guarded"
-        self.wheel_base = wheel_base
         self.width, self.height = arena
         self.pose: Pose = (0.0, 0.0, 0.0)
 
@@ -178,3 +179,25 @@ def motion(actions: NDArray[Any]) -> tuple[NDArray[np.float64], NDArray[np.float
         return (left + right) / 2, ((right - left) / (2 * TURN_SHARE)).clip(-1, 1)
     steer = actions - 1.0 if actions.ndim == 1 else actions[:, 0]
     return 1 - abs(steer), steer
+
+
+def pose_errors(true: NDArray[np.float64], estimated: NDArray[np.float64]) -> dict[str, float]:
+    """Return how far estimates were from the truth over a trial, at whose start they are equal.
+
+    Args:
+        true: poses (x [m], y [m], heading [rad]) at the start and after every decision.
+            Shape: (T, 3).
+        estimated: where the robot believed to be. Shape: (T, 3).
+
+    Returns:
+        `pose_error` and `pose_error_max`, the mean and the largest distance [m], and
+        `heading_error`, the mean absolute difference of the headings [rad].
+    """
+    difference = (true - estimated)[1:]
+    distance = np.hypot(difference[:, 0], difference[:, 1])
+    turn = np.abs((difference[:, 2] + math.pi) % (2 * math.pi) - math.pi)
+    return {
+        "pose_error": float(distance.mean()),
+        "pose_error_max": float(distance.max()),
+        "heading_error": float(turn.mean()),
+    }

@@ -10,15 +10,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sofnn_torch.maze.odometry import Pose
+from sofnn_torch.maze.arguments import real, whole
+from sofnn_torch.maze.env import LEFT, RIGHT, STRAIGHT
+from sofnn_torch.maze.odometry import STEP_LENGTH, STEP_TURN, Pose
 from sofnn_torch.maze.robot import MazePlan, Physics
 from sofnn_torch.terminal import command
 
-STEP_LENGTH = 0.005  # m, one straight step
-STEP_TURN = 0.08  # rad, one turning step
 MAX_TURN = 4.0  # rad to either side of the start heading; no sensible run winds up further
 FREE_SPACE_CELL = 0.0005  # m, of the grid that says where a wall is
-TURNS = np.array([-1, 0, 1])  # right, straight, left, in the order of the environment's actions
+ACTIONS = np.array([RIGHT, STRAIGHT, LEFT], dtype=np.int8)
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class Optimum:
     """A shortest run: its length in simulator steps, its held actions and the poses between."""
 
     steps: int
-    actions: list[int]  # 0 right, 1 straight, 2 left
+    actions: list[int]  # of the environment's "three"
     path: list[Pose]  # before each action, and at the end
 
 
@@ -36,7 +36,7 @@ def optimal_steps(
     """Find the fewest simulator steps from the start to the goal without touching a wall.
 
     Breadth-first search, one level per action. Headings are exact, as turns are multiples of
-    `hold` x 0.08 rad; positions are exact along each path, but of all paths that reach the same
+    `hold` x `STEP_TURN`; positions are exact along each path, but of all paths that reach the same
     cell of the floor at the same heading only the first is followed. So the result is a run that
     can be driven, and tends to the optimum as cells shrink.
 
@@ -47,8 +47,11 @@ def optimal_steps(
         skin: distance [m] kept from walls.
 
     Raises:
-        ValueError: if the goal cannot be reached.
+        ValueError: if the goal cannot be reached, or an argument is out of range.
     """
+    hold, resolution, skin = whole("hold", hold), real("resolution", resolution), real("skin", skin)
+    if not (resolution > 0.0 and skin >= 0.0):
+        raise ValueError(f"resolution must be positive and skin not negative: {resolution}, {skin}")
     free = _free_space(plan, skin)
     half = math.ceil(MAX_TURN / (hold * STEP_TURN))
     columns = math.ceil(plan.size[0] / resolution) + 1
@@ -75,12 +78,12 @@ def optimal_steps(
 
         index = np.arange(x.size, dtype=np.int32)
         parent = np.concatenate([index, index[clear], index])
-        action = np.repeat(np.int8([0, 1, 2]), [x.size, int(clear.sum()), x.size])
-        straight = action == 1
+        action = np.repeat(ACTIONS, [x.size, int(clear.sum()), x.size])
+        straight = action == STRAIGHT
         x, y = x[parent], y[parent]
         x[straight] += hold * dx[clear]
         y[straight] += hold * dy[clear]
-        turns = turns[parent] + TURNS[action]
+        turns = turns[parent] + action - STRAIGHT
 
         keep = np.flatnonzero(np.abs(turns) <= half)
         column, row = (x[keep] / resolution).astype(int), (y[keep] / resolution).astype(int)
@@ -113,7 +116,7 @@ def _look_up(free: NDArray[np.bool_], x: NDArray, y: NDArray) -> NDArray[np.bool
 
 def _trace_back(levels: list, index: int, last: int, start_heading: float, hold: int) -> Optimum:
     """Follow the parents of a state, from which `last` straight steps lead into the goal."""
-    actions, path = [1], []
+    actions, path = [STRAIGHT], []
     for x, y, turns, parent, action in reversed(levels):
         heading = start_heading + hold * STEP_TURN * turns[index]
         path.append((float(x[index]), float(y[index]), float(heading)))

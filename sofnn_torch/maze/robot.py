@@ -4,10 +4,12 @@ import math
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
 
+from sofnn_torch.maze.arguments import choice, show, whole
 from sofnn_torch.maze.odometry import STEP_SECONDS, WHEEL_RADIUS, Pose, wrap_angle
 
 INFRARED = (
@@ -37,14 +39,19 @@ def load_model(path: str | Path | None = None, drawn: bool = True) -> mujoco.MjM
     Without the `drawn` geoms that collide with nothing, physics is the same and faster.
 
     Raises:
-        ValueError: if there is no such file.
+        ValueError: if there is no such file, or MuJoCo cannot read it.
     """
+    if not isinstance(path, str | Path | None):
+        raise ValueError(f"model_path must be the path of an MJCF file, not {show(path)}")
     path = Path(path) if path is not None else default_model_path()
     if not path.is_file():
         raise ValueError(f"no MJCF file at {path}")
-    spec = mujoco.MjSpec.from_file(str(path))
-    spec.compiler.discardvisual = not drawn
-    return spec.compile()
+    try:
+        spec = mujoco.MjSpec.from_file(str(path))
+        spec.compiler.discardvisual = not drawn
+        return spec.compile()
+    except Exception as error:  # MuJoCo's own are of several kinds and lines
+        raise ValueError(f"{path} is no MJCF model: {' '.join(str(error).split())}") from error
 
 
 def heading_of(w: float, x: float, y: float, z: float) -> float:
@@ -74,6 +81,8 @@ class MazePlan:
             if geom.name.startswith("wall"):
                 (x, y, _), (a, b, _) = geom.pos.tolist(), geom.size.tolist()
                 walls.append((x - a, y - b, x + a, y + b))
+        if not walls:
+            raise KeyError("a geom whose name begins with wall")
         sites = [model.site(i) for i in range(model.nsite)]
         zones = {site.name: (tuple(site.pos[:2].tolist()), site.size.item(0)) for site in sites}
         subgoals = [zones[name] for name in sorted(zones) if name.startswith("subgoal")]
@@ -86,7 +95,7 @@ class MazePlan:
             goal=zones["goal"][0],
             goal_radius=zones["goal"][1],
             subgoals=[position for position, _ in subgoals],
-            subgoal_radius=subgoals[0][1],
+            subgoal_radius=subgoals[0][1] if subgoals else 0.0,
             start_radius=zones["start"][1],
             robot_radius=model.geom("rim").size.item(0),
         )
@@ -120,12 +129,44 @@ class Physics:
         # Sensors are evaluated on demand: 8 rays in every timestep would double its cost.
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_SENSOR
         self.data = mujoco.MjData(model)
-        self.plan = MazePlan.from_model(model)
-        self._qpos, self._ctrl = self.data.qpos, self.data.ctrl
-        self._left_wheel = model.joint("wheel_left").qposadr.item()
-        self._right_wheel = model.joint("wheel_right").qposadr.item()
-        self._floor = model.geom("floor").id
+        try:
+            self.plan = MazePlan.from_model(model)
+            self._left_wheel = model.joint("wheel_left").qposadr.item()
+            self._right_wheel = model.joint("wheel_right").qposadr.item()
+            self._floor = model.geom("floor").id
+            for name in INFRARED:
+                model.sensor(name)
+        except KeyError as error:
+            what = str(error.args[0]).split(". Valid")[0]
+            raise ValueError(f"the model lacks an element of the standard maze: {what}") from error
+        self._look_at_data()
         self.place(self.plan.start)
+
+    def _look_at_data(self) -> None:
+        self._qpos, self._ctrl = self.data.qpos, self.data.ctrl
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what a copy or a pickle takes along; its views will be of its own data."""
+        return {name: self.__dict__[name] for name in self.__dict__.keys() - {"_qpos", "_ctrl"}}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Become a copy."""
+        self.__dict__.update(state)
+        self._look_at_data()
+
+    def check_view(self, camera: str, width: int, height: int) -> tuple[str, int, int]:
+        """Return a camera and the size [pixels] of its pictures as plain values.
+
+        Raises:
+            ValueError: if there is no such camera, or the offscreen buffer is smaller.
+        """
+        cameras = tuple(self.model.camera(i).name for i in range(self.model.ncam))
+        limit = self.model.vis.global_
+        return (
+            choice("camera", camera, cameras),
+            whole("width", width, limit.offwidth),
+            whole("height", height, limit.offheight),
+        )
 
     def place(self, pose: Pose) -> None:
         """Put the robot down at rest at a pose (x [m], y [m], heading [rad])."""

@@ -1,12 +1,25 @@
 """Settings of robot and maze; those of the environment by itself are the same."""
 
+import math
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from sofnn_torch.bounds import Positive, Settings, Within
+from sofnn_torch.network.axes import Axis
 
 Actions = Literal["three", "steer", "wheels"]
 Whole = Annotated[int, Within(above=0)]
+
+POSE = (
+    Axis("x", "m", 0.0, 1.0),
+    Axis("y", "m", 0.0, 1.0),
+    Axis("heading", "rad", -math.pi, math.pi, period=2 * math.pi),
+)
+ACTION_NAMES = {
+    "three": ("right turn", "straight", "left turn"),
+    "steer": ("steer",),
+    "wheels": ("left wheel", "right wheel"),
+}
 
 
 @dataclass(frozen=True)

@@ -1,20 +1,58 @@
-"""What may cut a run short: a signal, and numbers that diverge."""
+"""Numbers that diverge: found, told, and made an end of."""
 
 import math
+from typing import Any, Self
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
 from sofnn_torch.learners.learner import Learner
 
 FARTHEST = 100.0  # metres, radians: no rule out there ever fires
 WIDEST = 50.0  # times the width of a new rule: it fires everywhere and no more rules are added
 LARGEST = 1e9  # no reward and no step size that make sense lead to a consequent beyond this
+FAILURES = (ArithmeticError, RuntimeError, ValueError, StopIteration)
 WARNINGS = ("BADQPOS", "BADQVEL", "BADQACC", "BADCTRL", "CONTACTFULL", "CNSTRFULL", "INERTIA")
 
 
 class Divergence(ArithmeticError):
     """Numbers stopped being finite or sensible; the message says which."""
+
+
+class Watch:
+    """Looks for numbers that diverge while a trial is played, and says where they did.
+
+    Args:
+        agent: the learner.
+        env: the environment, whose physics may warn.
+        observation: the last one.
+
+    Raises:
+        Divergence: on leaving, or on a `check`.
+    """
+
+    def __init__(self, agent: Learner, env: Any, observation: NDArray[Any]):
+        self.agent, self.env, self.observation = agent, env, observation
+
+    def check(self, reward: float) -> None:
+        """Look at the last decision: one sum stands for all, which is finite if all terms are."""
+        if not math.isfinite(sum(self.observation.tolist(), reward + self.agent.value)):
+            raise Divergence(self._diagnosis() or "a value estimate is not finite")
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: Any, error: BaseException | None, _: object) -> None:
+        # Code that meets a NaN fails in its own ways; what matters is where the NaN is.
+        if isinstance(error, Divergence) or not isinstance(error, (*FAILURES, type(None))):
+            return
+        warnings = physics_warnings(self.env) if error is None else ""
+        if what := warnings or self._diagnosis():
+            raise Divergence(what) from error
+
+    def _diagnosis(self) -> str:
+        return diagnose(self.agent, self.observation)
 
 
 def diagnose(agent: Learner, observation: np.ndarray) -> str:

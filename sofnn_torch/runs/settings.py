@@ -21,21 +21,11 @@ from sofnn_torch.learners.learner import Learner, Task
 from sofnn_torch.learners.qlearning import QConfig
 from sofnn_torch.learners.sga import SGAConfig
 from sofnn_torch.maze.odometry import wheel_speeds
-from sofnn_torch.maze.settings import MazeConfig
+from sofnn_torch.maze.settings import ACTION_NAMES, POSE, MazeConfig
 from sofnn_torch.network.axes import Axis
 from sofnn_torch.network.settings import NetworkConfig
 from sofnn_torch.runs import presets
 
-POSE = (
-    Axis("x", "m", 0.0, 1.0),
-    Axis("y", "m", 0.0, 1.0),
-    Axis("heading", "rad", -math.pi, math.pi, period=2 * math.pi),
-)
-ACTIONS = {
-    "three": ("right turn", "straight", "left turn"),
-    "steer": ("steer",),
-    "wheels": ("left wheel", "right wheel"),
-}
 PRESET: Any = None  # as a default: the value of the preset
 
 
@@ -101,7 +91,7 @@ class Config(Settings):
     def task(self) -> Task:
         """What the robot learns."""
         kind = self.maze.actions
-        return Task(POSE, ACTIONS[kind], kind == "three", wheel_speeds)
+        return Task(POSE, ACTION_NAMES[kind], kind == "three", wheel_speeds)
 
     def to_json(self) -> str:
         """The settings as readable JSON."""
