@@ -169,7 +169,7 @@ def growth(repeats: int) -> list[dict[str, Any]]:
         functions = {name: decide(agent) for name, agent in agents.items()}
         times = interleaved(functions | {"minimal": minimal(rules, 3)}, repeats)
         net = agents["sga"].net
-        held = sum(t.untyped_storage().nbytes() for t in (net.blocks[0], *net.buffers()))
+        held = sum(t.untyped_storage().nbytes() for t in net.state_dict().values())
         row = {"rules": rules, "sga KiB": held / 1024}
         rows.append(row | {f"{name} us": median(values) for name, values in times.items()})
     return rows

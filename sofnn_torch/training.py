@@ -18,13 +18,13 @@ from sofnn_torch.maze.env import KheperaMazeEnv
 from sofnn_torch.pictures.tensorboard import Monitor
 from sofnn_torch.runs import checkpoint, session
 from sofnn_torch.runs.guard import Divergence, Watch
-from sofnn_torch.runs.session import RunOptions, Session, arithmetic, environment_seed
+from sofnn_torch.runs.session import RunOptions, Session, arithmetic
 from sofnn_torch.runs.settings import Config, from_dict
 from sofnn_torch.runs.signals import Interrupted, SignalTrap
 from sofnn_torch.runs.trial import Recorder, Trajectory, TrialRecord
 from sofnn_torch.terminal import plural, say
 
-__all__ = ["RunOptions", "environment_seed", "play", "replay", "resume", "train"]
+__all__ = ["RunOptions", "play", "replay", "resume", "train"]
 
 
 def play(
@@ -76,7 +76,7 @@ def train(config: Config, options: RunOptions | None = None) -> Path:
         OSError: the disk refused the last checkpoint; the message says where it is instead.
     """
     options = options or RunOptions()
-    with SignalTrap() as trap, arithmetic(options.threads):
+    with SignalTrap() as trap, arithmetic(options.threads, options.portable):
         return _loop(session.begin(config, options), options, trap)
 
 
@@ -94,7 +94,7 @@ def resume(path: Path | str, options: RunOptions | None = None, trials: int | No
         ValueError, Interrupted, Divergence, OSError: as `train`.
     """
     options = options or RunOptions()
-    with SignalTrap() as trap, arithmetic(options.threads):
+    with SignalTrap() as trap, arithmetic(options.threads, options.portable):
         reopened = session.reopen(Path(path), options, trials)
         if reopened.trial == reopened.run.config.trials:
             reopened.close()

@@ -232,7 +232,7 @@ def test_wrong_parts_inside_a_state_are_refused(state, tmp_path):
 @pytest.mark.parametrize("rows,columns", [(-1, 0), (1, 0), (0, -1), (0, 1)])
 def test_wrong_shapes_are_refused(rows, columns, state, tmp_path):
     net = copy.copy(state["agent"]["net"])
-    for name in ("blocks.0", "traces_store"):
+    for name in ("blocks.centres.0", "traces", "labels"):
         a, b = net[name].shape
         net[name] = torch.zeros(a + rows, b + columns)
         rewrite(tmp_path / "shape.pt", edited(state, ("agent", "net"), net))
@@ -245,7 +245,7 @@ def test_a_state_of_another_network_is_refused(entry, value, state, tmp_path):
     assert "does not fit its settings ({'n_inputs': 3" in refused(tmp_path / "other.pt")
 
 
-@pytest.mark.parametrize("place", [("net", "traces_store"), ("memory", "rows")])
+@pytest.mark.parametrize("place", [("net", "traces"), ("memory", "rows")])
 def test_numbers_of_another_precision_are_refused(place, state, tmp_path):
     double = state["agent"][place[0]][place[1]].double()
     rewrite(tmp_path / "double.pt", edited(state, ("agent", *place), double))
@@ -253,10 +253,12 @@ def test_numbers_of_another_precision_are_refused(place, state, tmp_path):
     assert message in refused(tmp_path / "double.pt")
 
 
-@pytest.mark.parametrize("rules", [-1, 10**6])
+@pytest.mark.parametrize("rules", [0, 10**4])
 def test_an_impossible_rule_count_is_refused(rules, state, tmp_path):
-    place = ("agent", "net", "_extra_state", "n_rules")
-    rewrite(tmp_path / "rules.pt", edited(state, place, rules))
+    net = copy.copy(state["agent"]["net"])
+    for name in ("traces", "usage", "labels"):
+        net[name] = net[name].new_zeros(*net[name].shape[:-1], rules)
+    rewrite(tmp_path / "rules.pt", edited(state, ("agent", "net"), net))
     assert "does not fit its settings" in refused(tmp_path / "rules.pt")
 
 
@@ -306,7 +308,10 @@ def unusable(run, state, tmp_path_factory):
     (place / "empty").write_bytes(b"")
     torch.save({"model": torch.zeros(3)}, place / "foreign")
     rewrite(place / "future", state, version=checkpoint.VERSION + 1)
-    rewrite(place / "other shapes", edited(state, ("agent", "net", "blocks.0"), torch.zeros(2, 2)))
+    rewrite(
+        place / "other shapes",
+        edited(state, ("agent", "net", "blocks.centres.0"), torch.zeros(2, 2)),
+    )
     other = training.train(settings(net={"theta": 0.5}), quick_options(place / "other"))
     shutil.copy(other / "checkpoint-4.pt", place / "other settings")
     return place

@@ -120,8 +120,7 @@ def test_the_policy_is_drawn_only_where_the_robot_can_be(plan, axes):
 def test_the_policy_bends_to_the_side_of_the_turn(plan, axes):
     agent = learner("sga")
     for value, side in ((1.0, 1), (-1.0, -1)):
-        with torch.no_grad():
-            agent.net.blocks[0][2 * agent.net.n_inputs] = value  # every rule turns to one side
+        agent.net.consequents[:, 0] = value  # every rule turns to one side
         axes.clear()
         figures.action_field(plan, agent, axes, headings=4)
         begin, end = np.array(axes.collections[0].get_segments())[0]  # heading -pi, to the west

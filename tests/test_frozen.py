@@ -81,7 +81,7 @@ def test_a_hotter_roulette_and_a_wider_normal_density():
     assert stats.chisquare(counts, 6000 * chances / chances.sum()).pvalue > 1e-3
 
     agent = sga_learner(rules=1)
-    agent.net.blocks[0].data[-3:-1, 0] = torch.tensor([0.1, 0.02])
+    agent.net.consequents[0, :2] = torch.tensor([0.1, 0.02])
     sample = np.array([agent.act(x, 5)[0] for _ in range(4000)])
     assert sample.mean() == pytest.approx(0.1, abs=0.01)
     assert sample.std() == pytest.approx(0.1, abs=0.005)

@@ -154,7 +154,7 @@ def test_no_following_value_counts_for_more_than_the_limit_in_replay(value, limi
     agent, x = single(0.0, replays=1, value_limit=limit)
     agent.start(x)
     agent.step(0.2, x, False, truncated=True)
-    agent.net.blocks[0].data[-1, 0] = value
+    agent.net.consequents[0, -1] = value
     agent.start(x)
     error = 0.2 + 0.9 * counts - value
     assert agent.net.consequents[0, -1].item() == pytest.approx(value + 0.5 * error)
@@ -162,7 +162,7 @@ def test_no_following_value_counts_for_more_than_the_limit_in_replay(value, limi
 
 def test_sga_remembers_the_action_that_it_sampled_not_the_clipped_one():
     agent, x = single(0.0, replays=1)
-    agent.net.blocks[0].data[-3, 0] = 0.99
+    agent.net.consequents[0, 0] = 0.99
     action = agent.start(x)
     agent.step(0.0, x, True)
     sampled = 0.99 + 0.5 * np.random.default_rng(0).standard_normal()

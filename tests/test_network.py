@@ -36,9 +36,7 @@ def grown(count=300, seed=0, **settings):
     net = network(**settings)
     for x in states(count, seed):
         net.grow(x)
-    with torch.no_grad():
-        for block in net.blocks:
-            block[-net.n_outputs :, :].normal_(generator=torch.Generator().manual_seed(seed))
+    net.consequents.normal_(generator=torch.Generator().manual_seed(seed))
     return net
 
 
@@ -136,12 +134,14 @@ def test_a_batch_takes_centres_of_any_turn():
 def test_the_gradient_of_a_batch_is_the_sum_of_its_states():
     net, x = grown(), states(32, seed=3)
     weights = torch.rand(32, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    batch = torch.autograd.grad((net(x) * weights).sum(), net.blocks[0])[0]
+    parameters = list(net.parameters())
+    batch = torch.autograd.grad((net(x) * weights).sum(), parameters)
     single = [
-        torch.autograd.grad((net(row[None]) * w).sum(), net.blocks[0])[0]
+        torch.autograd.grad((net(row[None]) * w).sum(), parameters)
         for row, w in zip(x, weights, strict=True)
     ]
-    torch.testing.assert_close(batch, sum(single), rtol=1e-8, atol=1e-9)
+    for whole, *parts in zip(batch, *single, strict=True):
+        torch.testing.assert_close(whole, sum(parts), rtol=1e-8, atol=1e-9)
 
 
 @pytest.mark.parametrize("growth", ["rule", "input", "literal"])
@@ -252,7 +252,9 @@ def test_growth_keeps_everything_learned_across_blocks():
     for k, x in enumerate(states(40)):
         net.add_rule(x)
         net.traces[:, k], net.usage[k] = float(k), float(k)
-    assert [b.shape[1] for b in net.blocks] == [4, 4, 8, 16, 32]
+    for kind, rows in (("centres", 3), ("widths", 3), ("consequents", 2)):
+        shapes = [tuple(block.shape) for block in net.blocks[kind]]
+        assert shapes == [(rows, size) for size in (4, 4, 8, 16, 32)]
     torch.testing.assert_close(net.centres, states(40))
     assert net.traces[0].tolist() == net.usage.tolist() == list(map(float, range(40)))
 
@@ -352,7 +354,7 @@ def test_a_copy_learns_in_parameters_of_its_own(duplicate):
     before, twin = net.table().detach().clone(), duplicate(net)
     assert torch.equal(twin.table(), before)
     twin.clamp_consequents(0, 2, 3.0, 3.0)
-    assert (twin.table()[-2:] == 3).all()  # the joined blocks, which optimizers see
+    assert (twin.part(2) == 3).all()  # the joined blocks, which optimizers see
     assert torch.equal(net.table(), before)
 
 

@@ -120,3 +120,31 @@ def test_the_examples_and_links_of_the_readme_work():
     links = re.findall(r"\]\(([^)#:]+)\)", text)
     assert len(links) > 8
     assert [link for link in links if not (ROOT / link).exists()] == []
+
+
+def python(code, **environment):
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, env=os.environ | environment
+    )
+    return done.returncode, done.stdout.strip(), done.stderr.strip()
+
+
+def test_every_name_of_the_package_can_be_imported():
+    assert sorted(sofnn_torch.__all__) == sorted(sofnn_torch.HOMES)
+    assert all(getattr(sofnn_torch, name) for name in sofnn_torch.__all__)
+    assert set(sofnn_torch.__all__) <= set(dir(sofnn_torch))
+    with pytest.raises(AttributeError, match="has no attribute 'SONFN'"):
+        sofnn_torch.SONFN  # noqa: B018
+
+
+def test_the_network_and_the_learners_load_without_the_simulator():
+    heavy = "'mujoco', 'matplotlib', 'scipy', 'tensorboard'"
+    names = "SOFNN, grid, Axis, SGA, QLearning, Task"
+    code = f"from sofnn_torch import {names}; import sys; print({{{heavy}}} & {{*sys.modules}})"
+    assert python(code) == (0, "set()", "")
+
+
+def test_a_simulator_that_does_not_load_is_an_import_error_that_can_be_caught():
+    code = "try:\n import sofnn_torch.training\nexcept ImportError as e:\n print(e)\nprint('on')"
+    code, out, _ = python(code, MUJOCO_GL="nonsense")
+    assert code == 0 and "MUJOCO_GL=nonsense" in out and out.endswith("on")

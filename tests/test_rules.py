@@ -172,8 +172,8 @@ def test_unchanged_rules_make_a_run_that_goes_on_like_the_old_one(trained, tmp_p
         assert equal(state[part], source[part]), part
     assert all(equal(state["agent"][k], source["agent"][k]) for k in ("rng", "value"))
     assert equal(state["agent"].get("memory"), source["agent"].get("memory"))
-    assert not state["agent"]["net"]["traces_store"].any()
-    assert not state["agent"]["net"]["usage_store"].any()
+    assert not state["agent"]["net"]["traces"].any()
+    assert not state["agent"]["net"]["usage"].any()
     assert (state["recent"], state["best"]) == ([], [])
     assert (new / "trials.csv").read_bytes() == (old / "trials.csv").read_bytes()
     assert load_config(new) == load_config(old)
@@ -183,7 +183,7 @@ def test_unchanged_rules_make_a_run_that_goes_on_like_the_old_one(trained, tmp_p
         training.resume(path, quick_options(runs), trials=4)
     assert (new / "trials.csv").read_bytes() == (old / "trials.csv").read_bytes()
     (_, state, _), (_, source, _) = map(checkpoint.find_latest, (new, old))
-    assert torch.equal(*(s["agent"]["net"]["blocks.0"] for s in (state, source)))
+    assert torch.equal(*(s["agent"]["net"]["blocks.consequents.0"] for s in (state, source)))
     assert json.loads((new / "config.json").read_text())["earlier"] == [session]
 
 
@@ -254,10 +254,10 @@ def test_replaced_rules_grow_and_learn_on():
     net.replace_rules(*(torch.cat([part, part[:2]]) for part in (new, widths[:2], consequents[:2])))
     first, second, *again = net.labels.T.tolist()
     assert again == [first, second] and not set(first) & set(second)
-    (block,) = net.blocks
-    assert block.data_ptr() == net._whole.data_ptr()  # still a window into the one table
+    (block,) = net.blocks["centres"]
+    assert block.data_ptr() == net.centres.data_ptr()  # still a window into the one table
     assert net.grow(torch.tensor([5.0, 5.0, 5.0]))
-    assert net.n_rules == 5 and len(net.blocks) == 2
+    assert net.n_rules == 5 and len(net.blocks["centres"]) == 2
     assert net(torch.rand(2, 3)).shape == (2, 2)
     net.observe(torch.rand(3))
     assert net.usage.sum() == pytest.approx(1)

@@ -176,7 +176,7 @@ def single(value, **settings):
     """A learner of values alone with one rule of mu 0.2 and sigma 0.5, and the state there."""
     rates = {"rate_mean": 0.0, "rate_deviation": 0.0, "rate_value": 0.5}
     agent = learner(rules=1, gamma=0.9, **rates, **settings)
-    agent.net.blocks[0].data[-3:, 0] = torch.tensor([0.2, 0.5, value])
+    agent.net.consequents[0] = torch.tensor([0.2, 0.5, value])
     return agent, agent.net.centres[0].numpy().copy()
 
 
@@ -221,7 +221,7 @@ def test_sigma_and_mu_stay_in_bounds():
 
 def test_sampled_actions_have_the_moments_of_equation_5():
     agent = learner(rules=1)
-    agent.net.blocks[0].data[-3:-1, 0] = torch.tensor([0.1, 0.2])
+    agent.net.consequents[0, :2] = torch.tensor([0.1, 0.2])
     x = np.array([0.0, 0.0, 0.0])
     sample = np.array([agent.act(x, explore=True)[0] for _ in range(4000)])
     assert sample.mean() == pytest.approx(0.1, abs=0.015)
@@ -241,7 +241,7 @@ def test_the_negative_log_likelihood_is_that_of_the_normal_density():
 )
 def test_the_scalar_is_cut_into_three_actions(mean, command):
     agent = learner(rules=1, discrete=3)
-    agent.net.blocks[0].data[-3, 0] = mean
+    agent.net.consequents[0, 0] = mean
     assert agent.act(np.zeros(3)) == command
     assert agent.plan(np.zeros((1, 3))).choice.tolist() == [command]
 
@@ -250,7 +250,7 @@ def test_the_scalar_is_cut_into_three_actions(mean, command):
 def test_any_number_of_discrete_actions_are_equal_parts_of_the_range(count):
     agent = learner(rules=1, discrete=count)
     for mean in np.linspace(-0.985, 0.985, 40):
-        agent.net.blocks[0].data[-3, 0] = mean
+        agent.net.consequents[0, 0] = mean
         expected = min(int((mean + 1) / 2 * count), count - 1)
         assert agent.act(np.zeros(3)) == expected
         assert agent.plan(np.zeros((1, 3))).choice.tolist() == [expected]

@@ -6,6 +6,7 @@ from typing import Annotated
 import tyro
 
 from sofnn_torch.bounds import Positive, Settings, Within
+from sofnn_torch.network.growth import criterion
 
 Rules = Annotated[int, Within(above=0)]
 
@@ -36,3 +37,8 @@ class NetworkConfig(Settings, table="net"):
         50_000
     )
     """Hard limit; beyond it no rule is added and a warning is shown."""
+
+    def __post_init__(self) -> None:
+        """Check the numbers, and that there is such a criterion."""
+        super().__post_init__()
+        criterion(self.growth, self.theta)

@@ -14,22 +14,20 @@ traces and the steps of learning in them are in `sofnn_torch.network.table`.
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Literal
 
 import torch
 from torch import Tensor
 
 from sofnn_torch.network import batches
 from sofnn_torch.network.axes import Axis, named
+from sofnn_torch.network.growth import Criterion, criterion
 from sofnn_torch.network.table import RuleTable
-
-Growth = Literal["rule", "input", "literal", "frozen"]
 
 
 class SOFNN(RuleTable):
     """Fuzzy network that adds a rule where no existing membership reaches ``theta``.
 
-    `RuleTable` describes what the rules hold. Letters in shapes: ``n`` inputs, ``m`` outputs, ``K``
+    `RuleStore` describes what the rules hold. Letters in shapes: ``n`` inputs, ``m`` outputs, ``K``
     rules, ``B`` states in a batch, ``F`` features of a state.
 
     Args:
@@ -38,11 +36,9 @@ class SOFNN(RuleTable):
         n_outputs: number of consequents per rule ``m``.
         width: width given to new membership functions, one for all inputs or one each.
         theta: growth threshold ``theta_th`` of equation 3, in (0, 1).
-        growth: reading of equation 3. ``rule``: a rule is added when no rule's firing strength
-            reaches theta. ``input``: an input whose memberships all stay under theta gets a new
-            membership function, and each newly met combination of best membership functions
-            becomes a rule. ``literal``: a rule is added when no membership of any input
-            reaches theta. ``frozen``: the structure never changes (FSFNN).
+        growth: criterion of equation 3: ``rule``, ``input``, ``literal``, ``frozen`` (the structure
+            never changes), ``module:Class``, or a `Criterion` (`sofnn_torch.network.growth`), which
+            brings its own theta.
         initial: consequents of a new rule, one for all or one each.
         interpolate: give a new rule the network's present output instead of ``initial``, so that
             the output at its centre does not change; one for all consequents or one each (the
@@ -63,15 +59,15 @@ class SOFNN(RuleTable):
         *,
         width: float | Sequence[float],
         theta: float = 0.4,
-        growth: Growth = "rule",
+        growth: str | Criterion = "rule",
         initial: float | Sequence[float] = 0.0,
         interpolate: bool | Sequence[bool] = True,
         max_rules: int = 100_000,
         min_width: float = 1e-3,
-        block_size: int = 1024,
+        block_size: int = 32,
         dtype: torch.dtype = torch.float32,
     ):
-        self.axes = named(inputs)
+        self.axes, chosen = named(inputs), criterion(growth, theta)
         n_inputs = len(self.axes)
         super().__init__(
             n_inputs,
@@ -79,14 +75,10 @@ class SOFNN(RuleTable):
             max_rules=max_rules,
             min_width=min_width,
             block_size=block_size,
-            shared=growth == "input",
+            shared=chosen.shared,
             dtype=dtype,
         )
-        if not 0.0 < theta < 1.0:
-            raise ValueError(f"theta must lie between 0 and 1, got {theta}")
-        if growth not in ("rule", "input", "literal", "frozen"):
-            raise ValueError(f"growth must be rule, input, literal or frozen, got {growth!r}")
-        self.growth, self.theta, self.log_theta = growth, theta, math.log(theta)
+        self.criterion, self.growth, self.theta = chosen, chosen.name, chosen.theta
         self.max_firing = 0.0  # at the last state observed
 
         def per(values, count: int, name: str) -> Tensor:
@@ -114,8 +106,7 @@ class SOFNN(RuleTable):
 
     def log_memberships(self, x: Tensor) -> Tensor:
         """Logarithm of equation 1 for x of shape (B, n). Shape: (B, n, K)."""
-        centres, widths, _ = self.table().split_with_sizes(self.parts)
-        return -0.5 * self._squares(x, centres, widths)
+        return -0.5 * self._squares(self._states(x), self.part(0), self.part(1))
 
     def firing_strengths(self, x: Tensor) -> Tensor:
         """Firing strengths F of equation 2 for x of shape (B, n). Shape: (B, K)."""
@@ -131,8 +122,12 @@ class SOFNN(RuleTable):
             x: states, or one state (n,) for one row (K,).
             antecedents: centres and widths, each (n, K); those of the network if None.
         """
-        centres, widths = antecedents or self.table().split_with_sizes(self.parts)[:2]
+        centres, widths = antecedents or (self.part(0), self.part(1))
+        x = self._states(x)
         if x.dim() == 2 and len(x) >= batches.LARGE:
+            if torch.is_autocast_enabled(x.device.type):  # what cancels needs all its digits
+                with torch.autocast(x.device.type, enabled=False):
+                    return self.normalised_firing(x, (centres, widths))
             factors = batches.factors(centres, widths, self.wrapping)
             features = batches.features(x.to(factors), self.wrapping)
             return batches.log_firing(features, factors, self.wrapping).softmax(-1).to(x)
@@ -161,8 +156,7 @@ class SOFNN(RuleTable):
 
     def forward(self, x: Tensor) -> Tensor:
         """Weighted mean of the consequents (eqs 4, 10) for x of shape (B, n). Shape: (B, m)."""
-        centres, widths, consequents = self.table().split_with_sizes(self.parts)
-        return self.normalised_firing(x, (centres, widths)) @ consequents.T
+        return self.normalised_firing(x) @ self.part(2).T
 
     def conclude(self, firing: Tensor) -> Tensor:
         """Outputs (m,) at a state whose normalised firing (K,) is known."""
@@ -197,44 +191,49 @@ class SOFNN(RuleTable):
         return firing
 
     def grow(self, x: Tensor) -> bool:
-        """Add at most one rule at the state x of shape (n,) by equation 3; True if one was."""
+        """Add at most one rule at the state x of shape (n,) by equation 3; True if one was.
+
+        Raises:
+            ValueError: not one state of n numbers.
+        """
         if self.n_rules == 0:
-            return self.growth != "frozen" and self.add_rule(x)
+            return self.criterion.grows and self.add_rule(self._state(x))
         before = self.n_rules
         self._grow(x)
         return self.n_rules > before
 
+    @torch.no_grad()
     def _grow(self, x: Tensor) -> Tensor:
         """Apply equation 3; the logarithm of every rule's firing strength at x. Shape: (K,)."""
+        x = self._state(x)
         squares = self._squares(x, self._centres, self._widths)
         log_firing = squares.sum(0).mul_(-0.5)
         best = log_firing.max().item()
         self.max_firing = math.exp(best)
-        if self.growth == "rule":
-            added = best < self.log_theta and self.add_rule(x, log_firing=log_firing)
-        elif self.growth == "literal":
-            nearest = -0.5 * squares.min().item()
-            added = nearest < self.log_theta and self.add_rule(x, log_firing=log_firing)
-        else:
-            added = self.growth == "input" and self._combine(x, squares.mul_(-0.5))
-        if not added:
+        place = self.criterion.place(self, x, squares, log_firing, best)
+        if place is None:
             return log_firing
-        if self.growth == "input":  # the new rule is centred on other rules' memberships
-            newest = self._squares(x, self._centres[:, -1:], self._widths[:, -1:])
-            return torch.cat([log_firing, newest.sum(0).mul_(-0.5)])
-        return torch.cat([log_firing, log_firing.new_zeros(1)])  # centred on x
+        centre, width, labels = place
+        if not self.add_rule(centre, width, labels=labels, log_firing=log_firing):
+            return log_firing
+        if place.centre is x:
+            return torch.cat([log_firing, log_firing.new_zeros(1)])
+        newest = self._squares(x, self._centres[:, -1:], self._widths[:, -1:])
+        return torch.cat([log_firing, newest.sum(0).mul_(-0.5)])
 
-    def _combine(self, x: Tensor, log_memberships: Tensor) -> bool:
-        """Criterion ``input``: labels say which rules share a membership function."""
-        best, rule = log_memberships.max(1)
-        inputs = torch.arange(self.n_inputs, device=x.device)
-        is_new = best < self.log_theta
-        labels = torch.where(is_new, self.labels.amax(1) + 1, self.labels[inputs, rule])
-        if (self.labels == labels[:, None]).all(0).any():
-            return False
-        centre = torch.where(is_new, x, self._centres[inputs, rule])
-        width = torch.where(is_new, self.default_width, self._widths[inputs, rule])
-        return self.add_rule(centre, width, labels=labels)
+    def _state(self, x: Tensor) -> Tensor:
+        """One state (n,) in the network's type."""
+        if x.shape != self.default_width.shape:
+            raise ValueError(f"a state of {self.n_inputs} numbers is needed, got {tuple(x.shape)}")
+        return x if x.dtype == self.default_width.dtype else x.to(self.default_width)
+
+    def _states(self, x: Tensor) -> Tensor:
+        """States (.., n); of whole numbers or half precision in the network's type."""
+        if not 0 < x.dim() < 3 or x.shape[-1] != self.n_inputs:
+            shape = tuple(x.shape)
+            raise ValueError(f"states (B, {self.n_inputs}) are needed, got the shape {shape}")
+        precise = x.dtype in (torch.float32, torch.float64)
+        return x if precise else x.to(self.default_width.dtype)
 
     def add_rule(
         self,

@@ -1,123 +1,20 @@
-"""What fuzzy rules hold: a table of numbers that grows, and the steps that learning takes in it.
-
-Rules are the columns of a table with ``2 n + m`` rows ``[u_1..u_n, v_1..v_n, c_1..c_m]``: with
-the rules along the last axis every reduction over inputs is a vectorised sum, two to three times
-faster at batch size 1 than one row per rule. The Parameters in ``blocks`` are windows side by side
-into the one table; a full table appends a block as large as all before it together, so adding a
-rule costs a constant time on average, no Parameter is ever replaced, and no pass over the rules
-has to join the blocks first.
+"""What fuzzy rules learn: the steps of learning in their table, and rules that come and go.
 
 Each number has its eligibility trace beside it. How rules fire and where they are added is told in
-`sofnn_torch.network.sofnn`, what they learn from in `sofnn_torch.learners`.
+`sofnn_torch.network.sofnn`, what they learn from in `sofnn_torch.learners`, and where all numbers
+are kept in `sofnn_torch.network.store`.
 """
 
 import math
-from collections.abc import Sequence
-from typing import Self
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-VIEWS = {"_active", "_centres", "_widths", "_consequents", "_traces", "_consequent_traces"}
-VIEWS |= {"_usage", "_learning"}
-STORES = ("traces_store", "usage_store", "labels_store")  # what a rule has beside its parameters
+from sofnn_torch.network.store import RuleStore
 
 
-class RuleTable(nn.Module):
-    """Parameters of a number of rules that grows, with a trace for each and counters.
-
-    | Symbol | Shape | Meaning |
-    | --- | --- | --- |
-    | ``n``, ``m``, ``K`` | | inputs, outputs, rules |
-    | ``centres``, ``widths`` | (K, n) | antecedents ``u``, ``v`` in the units of the input |
-    | ``consequents`` | (K, m) | ``c``, what the rules conclude |
-    | ``traces`` | (2n+m, K) | eligibility trace of each parameter, kept beside it |
-    | ``usage`` | (K,) | sum of the normalised firing since it was last cleared |
-    | ``labels`` | (n, K) | which membership function each input of a rule uses, if shared |
-
-    Args:
-        n_inputs: number of inputs ``n``.
-        n_outputs: number of consequents per rule ``m``.
-        max_rules: most rules that the table may hold.
-        min_width: lower bound of adapted widths.
-        block_size: rules in the first block.
-        shared: rules may share membership functions; only then are labels kept.
-        dtype: of the parameters.
-
-    Raises:
-        ValueError: a number of inputs, outputs or rules is not positive.
-    """
-
-    def __init__(
-        self,
-        n_inputs: int,
-        n_outputs: int,
-        *,
-        max_rules: int,
-        min_width: float,
-        block_size: int,
-        shared: bool,
-        dtype: torch.dtype,
-    ):
-        super().__init__()
-        if n_inputs < 1 or n_outputs < 1:
-            raise ValueError("a network needs at least one input and one output")
-        if max_rules < 1 or block_size < 1:
-            raise ValueError("max_rules and block_size must be at least 1")
-        self.n_inputs, self.n_outputs = n_inputs, n_outputs
-        self.max_rules, self.refused = max_rules, 0
-        self.min_width, self.block_size, self.shared = min_width, block_size, shared
-        self.parts = (n_inputs, n_inputs, n_outputs)  # rows of u, v and c in the table
-        self.register_buffer("traces_store", torch.zeros(sum(self.parts), 0, dtype=dtype))
-        self.register_buffer("usage_store", torch.zeros(0, dtype=dtype))
-        self.register_buffer("labels_store", torch.zeros(n_inputs, 0, dtype=torch.long))
-        self._allocate([])
-
-    # -------------------------------------------------------------------------------------- views
-
-    def table(self) -> Tensor:
-        """All parameters of the active rules, differentiable. Shape: (2n+m, K)."""
-        if self.n_rules == 0:
-            raise ValueError("the network has no rules yet: call grow(x) or add_rule(centre)")
-        if not torch.is_grad_enabled():
-            return self._active
-        whole = self.blocks[0] if len(self.blocks) == 1 else torch.cat(list(self.blocks), 1)
-        return whole[:, : self.n_rules]
-
-    @property
-    def centres(self) -> Tensor:
-        """Centres u of the membership functions. Shape: (K, n)."""
-        return self._centres.T
-
-    @property
-    def widths(self) -> Tensor:
-        """Widths v of the membership functions. Shape: (K, n)."""
-        return self._widths.T
-
-    @property
-    def consequents(self) -> Tensor:
-        """Consequents c of the rules. Shape: (K, m)."""
-        return self._consequents.T
-
-    @property
-    def traces(self) -> Tensor:
-        """Eligibility traces E. Shape: (2n+m, K)."""
-        return self._traces
-
-    @property
-    def usage(self) -> Tensor:
-        """Sum of the normalised firing of each rule since it was last cleared. Shape: (K,)."""
-        return self._usage
-
-    @property
-    def labels(self) -> Tensor:
-        """Membership function that each rule uses for each input. Shape: (n, K)."""
-        return self.labels_store[:, : self.n_rules]
-
-    @property
-    def capacity(self) -> int:
-        """Rules that fit before the next block is appended."""
-        return self.usage_store.shape[0]
+class RuleTable(RuleStore):
+    """Rules that learn; `RuleStore` describes what they hold and its arguments."""
 
     # --------------------------------------------------------------- learning, eqs 6, 8, 14, 15
 
@@ -182,17 +79,22 @@ class RuleTable(nn.Module):
                 Shape: (n,).
 
         Raises:
-            ValueError: a value is not finite or a width is not positive.
+            ValueError: a value is not finite or a width is not positive, or other processes share
+                the memory.
         """
         k, n, numbers = self.n_rules, self.n_inputs, column.tolist()
         if not (math.isfinite(sum(map(abs, numbers))) and min(numbers[n : 2 * n]) > 0):
             raise ValueError(f"a rule needs finite numbers and positive widths: {numbers}")
+        if self._is_shared:
+            raise ValueError("other processes share this network: no rule can be added")
         if k == self.capacity:
-            self._append_block(max(k, self.block_size))
-        self._whole.select(1, k).copy_(column)
+            self._shape_blocks(self._sizes_for(k + 1))
+        for windows in self._windows:
+            self._followers.clear(windows[-1], k - self.capacity)
+        self._store["table"].select(1, k).copy_(column.detach())
         if self.shared:
-            fresh = self.labels.amax(1) + 1 if k else torch.zeros_like(self.labels_store[:, 0])
-            self.labels_store[:, k] = fresh if labels is None else labels
+            fresh = self.labels.amax(1) + 1 if k else 0
+            self._store["labels"][:, k] = fresh if labels is None else labels
         self._activate(k + 1)
 
     @torch.no_grad()
@@ -204,11 +106,8 @@ class RuleTable(nn.Module):
         """
         if keep.shape != (self.n_rules,) or not keep.any():
             raise ValueError(f"keep must be a mask of {self.n_rules} rules with at least one True")
-        before = self.n_rules
-        stores = {name: getattr(self, name)[..., :before][..., keep] for name in STORES}
-        self._fill(self._active[:, keep])
-        for name, values in stores.items():
-            getattr(self, name)[..., : self.n_rules] = values
+        before, kept = self.n_rules, keep.nonzero().flatten()
+        self._rewrite(kept, {name: store[..., kept] for name, store in self._store.items()})
         return before - self.n_rules
 
     @torch.no_grad()
@@ -228,7 +127,7 @@ class RuleTable(nn.Module):
                 ``max_rules``. Nothing is changed then.
         """
         count, n = len(centres), self.n_inputs
-        parts = [part.to(self._whole) for part in (centres, widths, consequents)]
+        parts = [part.to(self._active) for part in (centres, widths, consequents)]
         shapes = [tuple(part.shape) for part in parts]
         if shapes != [(count, rows) for rows in self.parts] or not 1 <= count <= self.max_rules:
             raise ValueError(
@@ -238,9 +137,8 @@ class RuleTable(nn.Module):
         table = torch.cat(parts, 1).T
         if not (table.isfinite().all() and (table[n : 2 * n] >= self.min_width).all()):
             raise ValueError(f"rules need finite numbers and widths of {self.min_width} or more")
-        labels = self._labels_for(table) if self.shared else 0
-        self._fill(table)
-        self.labels_store[:, :count] = labels
+        labels = {"labels": self._labels_for(table)} if self.shared else {}
+        self._rewrite(self.labels.new_empty(0), {"table": table} | labels)
 
     def _labels_for(self, table: Tensor) -> Tensor:
         """Which membership function each rule of another table (2n+m, K') uses. Shape: (n, K')."""
@@ -254,99 +152,15 @@ class RuleTable(nn.Module):
             labels.append(label[index[k:]])
         return torch.stack(labels)
 
-    # ------------------------------------------------------------------------------------- blocks
+    def _rewrite(self, kept: Tensor, columns: dict[str, Tensor]) -> None:
+        """Make these columns the rules, with zeros in what is not given.
 
-    def _fill(self, table: Tensor) -> None:
-        """Make the columns of a table (2n+m, K') the rules, with nothing beside them."""
-        count = table.shape[1]
-        self._allocate([max(count, self.block_size)])
-        self._whole[:, :count] = table
-        self._activate(count)
-
-    def _allocate(self, sizes: Sequence[int]) -> None:
-        """Start afresh with empty blocks of these sizes and no rule."""
-        self.blocks = nn.ParameterList()
-        for name in STORES:
-            setattr(self, name, getattr(self, name)[..., :0])
-        self.n_rules = 0
-        self._join()
-        for size in sizes:
-            self._append_block(size)
-
-    def _append_block(self, size: int) -> None:
-        self.blocks.append(nn.Parameter(self._whole.new_zeros(len(self._whole), size)))
-        for name in STORES:
-            store = getattr(self, name)
-            setattr(self, name, torch.cat([store, store.new_zeros(*store.shape[:-1], size)], -1))
-        self._join()
-
-    def _join(self) -> None:
-        """Make the blocks windows into one table, wherever their numbers were before."""
-        blocks = [block.detach() for block in self.blocks]
-        self._whole = torch.cat([torch.zeros_like(self.traces_store[:, :0]), *blocks], 1)
-        windows = self._whole.split_with_sizes([block.shape[1] for block in blocks], 1)
-        for block, window in zip(self.blocks, windows, strict=True):
-            block.data = window
-        self._activate(self.n_rules)
-
-    def _activate(self, n_rules: int) -> None:
-        """Set the number of rules; the views of what belongs to them are made when next needed."""
-        for name in VIEWS:
-            self.__dict__.pop(name, None)
-        self.__dict__["n_rules"] = n_rules  # past Module.__setattr__, which is slow
-
-    def __getattr__(self, name: str):
-        # A view costs as much as arithmetic on a thousand numbers: none is made twice.
-        if name not in VIEWS:
-            return super().__getattr__(name)
-        k, m = self.n_rules, self.n_outputs
-        active, traces = self._whole[:, :k], self.traces_store[:, :k]
-        centres, widths, consequents = active.split_with_sizes(self.parts)
-        last = traces[-m:]
-        self.__dict__.update(
-            _active=active,
-            _centres=centres,
-            _widths=widths,
-            _consequents=consequents,
-            _traces=traces,
-            _consequent_traces=last,
-            _usage=self.usage_store[:k],
-            # By the number of rows that learn.
-            _learning={m: (consequents, last), len(active): (active, traces)},
-        )
-        return self.__dict__[name]
-
-    # -------------------------------------------------------------------------- copies and state
-
-    def _apply(self, *arguments) -> Self:
-        super()._apply(*arguments)  # to another device or type, block by block
-        self._join()
-        return self
-
-    def __setstate__(self, state: dict) -> None:
-        super().__setstate__(state)  # a copy: the windows have become tables of their own
-        self._join()
-
-    def get_extra_state(self) -> dict[str, int]:
-        """Rule count and refused growth, part of ``state_dict``."""
-        return {"n_rules": self.n_rules, "refused": self.refused}
-
-    def set_extra_state(self, state: dict[str, int]) -> None:
-        """Counterpart of `get_extra_state`."""
-        if not 0 <= state["n_rules"] <= self.capacity:
-            raise ValueError(f"{state['n_rules']} rules do not fit {self.capacity} columns")
-        self.refused = state["refused"]
-        self._activate(state["n_rules"])
-
-    def _load_from_state_dict(self, state_dict, prefix, local_metadata, *args) -> None:
-        if local_metadata.get("assign_to_params_buffers"):
-            raise ValueError(
-                "load_state_dict(assign=True) would tear the blocks apart: leave it out"
-            )
-        # Growing to the stored size first lets a fresh network load a grown one strictly.
-        sizes, i = [], 0
-        while (block := state_dict.get(f"{prefix}blocks.{i}")) is not None:
-            sizes.append(block.shape[-1])
-            i += 1
-        self._allocate(sizes)
-        super()._load_from_state_dict(state_dict, prefix, local_metadata, *args)
+        Args:
+            kept: numbers of the rules that become the first, which optimizers remember.
+            columns: by the names of the stores.
+        """
+        for windows in self._windows:
+            self._followers.select(windows, kept)
+        count = columns["table"].shape[1]
+        self._shape_blocks(self._sizes_for(count))
+        self._write(columns, count)

@@ -139,7 +139,7 @@ def describe(net) -> dict[str, Any]:
         "growth": net.growth,
         "theta": net.theta,
         "max_rules": net.max_rules,
-        "blocks": [list(block.shape) for block in net.blocks],
+        "blocks": list(net.block_sizes),
     }
 
 
