@@ -25,6 +25,7 @@ PLAIN = {
         r"\1 must be \2 or None, got \3"
     ),
     r"Error parsing (\S+): (must be .+)": r"\1 \2",
+    r"Error parsing (\S+): Could not find valid parse .+?: (.+)": r"\1 cannot be \2",
     r"Error parsing (\S+): .+? \[(.+)\] into tuple .+\[(.+)\]": r"\1 must be \3, got \2",
     r"Error parsing \w+: (--.+)": r"\1",  # said by a check of the settings
 }

@@ -24,7 +24,7 @@ THOUSANDS = re.compile(r"[+-]?[1-9][0-9]{0,2}(,[0-9]{3})+")
 
 
 def decode(data: bytes) -> str:
-    r"""Text in UTF-8, in UTF-16 with a byte-order mark, or else in Latin-1; its lines end in \\n.
+    r"""Text in UTF-8, in UTF-16 with a byte-order mark, or else in Latin-1; its lines end in \n.
 
     Names and numbers are ASCII, which is the same in all the old encodings. So a file in one of
     them is read with other letters in its comments, which nobody reads.
@@ -66,9 +66,8 @@ def _numbers(text: str, names: Sequence[str], most: int) -> list[list[float]]:
     rows = _rows(text, _delimiter(text, names))
     header, table = next(rows, []), []
     places = [_place(name, header) for name in names]
-    width = max(place for place, cell in enumerate(header, 1) if cell)
     for number, row in enumerate(rows, 1):
-        if len(row) < width or any(row[len(header) :]):
+        if len(row) < len(header) or any(row[len(header) :]):
             raise ValueError(f"rule {number}: {len(row)} cells, the first line has {len(header)}")
         table.append([row[place] for place in places])
         if number > most:
