@@ -326,6 +326,10 @@ BAD_CSV = {
     "twice": (lambda text: text.replace("rule", "mu", 1), "column mu is there twice"),
     "no rules": (lambda text: text.splitlines()[0], "0 rules, must be 1 to 60"),
     "cells": (lambda text: text + "1,2\n", "2 cells, the first line has"),
+    "unquoted comma": (
+        lambda text: text.replace("0.06", "0,06", 1),
+        "rule 1: 12 cells, the first line has 11",
+    ),
     "word": (
         lambda text: text.replace("0.06", "wide", 1),
         "rule 1, width_x_m: must be a number, got",
