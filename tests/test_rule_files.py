@@ -183,7 +183,7 @@ HOSTILE = {
     "a name": (".csv", b"a" * LARGE, "not CSV (field larger than field limit"),
     "an open quote": (".csv", b'%s\n"' + b"1\n" * (LARGE // 2), "not CSV (field larger"),
     "rules": (".csv", b"%s\n" + b"1,0,0,0,1,1,1,0,1,0,0,t\n" * (LARGE // 24), "more than 60 rules"),
-    "blank rows": (".csv", b"%s" + b"\n" * (LARGE // 8), "0 rules"),
+    "blank rows": (".csv", b"%s" + b"\n" * LARGE, "0 rules"),
     "lists": (".json", b"[[]" + b",[]" * (LARGE // 3) + b"]", "more than"),
     "objects": (".json", b"[" + b'{"":0},' * (LARGE // 7), "more than"),
     "numbers": (".json", b"[1" + b",1" * (LARGE // 2) + b"]", "more than"),

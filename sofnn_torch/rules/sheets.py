@@ -17,7 +17,7 @@ from sofnn_torch.numerals import decimal
 MARKS = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 CONTROL = re.compile(r"[\x00-\x08\x0e-\x1f]")  # in no text, but in every binary file
 HINT = re.compile(r'\s*"?sep=.{1,9}\n', re.IGNORECASE)  # a line that tells Excel the delimiter
-LINE = re.compile(r"[^\n]*\n|[^\n]+")
+LINE = re.compile(r"[^\n]+\n?")  # an empty one has no cell
 DELIMITERS = ",;\t"
 MOST_COLUMNS = 16_384  # of a spreadsheet
 THOUSANDS = re.compile(r"[+-]?[1-9][0-9]{0,2}(,[0-9]{3})+")
