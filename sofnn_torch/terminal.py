@@ -11,6 +11,9 @@ from typing import Any
 
 import tyro
 from tqdm import tqdm
+from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
+
+from sofnn_torch import numerals
 
 # What tyro says, and how it is said here; the first that fits.
 PLAIN = {
@@ -21,11 +24,28 @@ PLAIN = {
     r"Error parsing (\S+): .+ \{None\}\|\{?(.+?)\}? could .+? from (\[.*?\])\..*": (
         r"\1 must be \2 or None, got \3"
     ),
-    r"Error parsing (\S+): .+ for int\(\) .+?: (.+)": r"\1 must be a whole number, got \2",
-    r"Error parsing (\S+): .+ to float: (.+)": r"\1 must be a number, got \2",
+    r"Error parsing (\S+): (must be .+)": r"\1 \2",
+    r"Error parsing (\S+): Could not find valid parse .+?: (.+)": r"\1 cannot be \2",
     r"Error parsing (\S+): .+? \[(.+)\] into tuple .+\[(.+)\]": r"\1 must be \3, got \2",
     r"Error parsing \w+: (--.+)": r"\1",  # said by a check of the settings
 }
+
+TYPES = ConstructorRegistry()
+
+
+@TYPES.primitive_rule
+def _plain_number(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
+    """How tyro reads ``int`` and ``float``: as in a file, only plain numbers are numbers."""
+    if info.type not in (int, float):
+        return None
+    read = numerals.whole if info.type is int else numerals.decimal
+    return PrimitiveConstructorSpec(
+        nargs=1,
+        metavar=info.type.__name__.upper(),
+        instance_from_str=lambda words: read(words[0]),
+        is_instance=lambda value: type(value) in (int, info.type),
+        str_from_instance=lambda value: [str(value)],
+    )
 
 
 def parse(kind: Any, argv: Sequence[str], description: str, default: Any = None) -> Any:
@@ -44,7 +64,7 @@ def parse(kind: Any, argv: Sequence[str], description: str, default: Any = None)
     messages = io.StringIO()
     settings = {} if default is None else {"default": default}
     try:
-        with contextlib.redirect_stderr(messages):
+        with TYPES, contextlib.redirect_stderr(messages):
             return tyro.cli(kind, args=argv, prog=_program(), description=description, **settings)
     except SystemExit as stop:
         if not stop.code:

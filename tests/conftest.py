@@ -7,6 +7,8 @@ import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from sofnn_torch.rules import __main__ as rules
+from sofnn_torch.rules import files
 from sofnn_torch.runs import checkpoint
 from sofnn_torch.runs.settings import Config
 from sofnn_torch.training import RunOptions
@@ -41,6 +43,38 @@ def quick():
 def options(tmp_path):
     """Options of runs under tmp_path / "runs"."""
     return quick_options(tmp_path / "runs")
+
+
+@pytest.fixture
+def call(monkeypatch, capsys):
+    """Runs the command of the rules: its exit code, output and error stream."""
+
+    def run(*arguments):
+        monkeypatch.setattr("sys.argv", ["rules", *map(str, arguments)])
+        try:
+            rules.main()
+            code = 0
+        except SystemExit as stop:
+            code = stop.code
+        return code, *capsys.readouterr()
+
+    return run
+
+
+def contents(folder):
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def parameters(agent):
+    return agent.net.table().detach().T.numpy()
+
+
+def written(agent, path, table=None):
+    """Write rules to a file: those of the learner if no others are given."""
+    write = files.to_json if path.suffix == ".json" else files.to_csv
+    table = parameters(agent) if table is None else table
+    path.write_bytes(write(files.schema(agent), table, {"usage": [0.5] * len(table)}))
+    return path
 
 
 def equal(a, b) -> bool:

@@ -82,7 +82,7 @@ def check(options: Options) -> None:
     outputs = {name: getattr(options, name) for name in ("json", "csv", "picture")}
     for name, path in outputs.items():
         endings = PICTURES if name == "picture" else (f".{name}",)
-        if path and path.suffix not in endings:
+        if path and path.suffix.lower() not in endings:
             raise ValueError(f"--{name} must end in {' or '.join(endings)}, got {path}")
         if path and (path.is_dir() or not path.parent.is_dir()):
             raise ValueError(f"--{name} {path}: not a file in an existing directory")

@@ -17,6 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sofnn_torch.learners.learner import Learner
+from sofnn_torch.rules import sheets
+from sofnn_torch.rules.sheets import show
 from sofnn_torch.runs.guard import FARTHEST, LARGEST, WIDEST
 
 FORMAT, VERSION = "sofnn-torch rules", 1
@@ -135,11 +137,13 @@ def read(path: Path, kind: Schema) -> NDArray[Any]:
         ValueError: one line that names the file, and the rule and the number where one is wrong.
     """
     try:
-        if path.suffix not in SUFFIXES:
+        suffix = path.suffix.lower()
+        if suffix not in SUFFIXES:
             raise ValueError("a rule file ends in .json or .csv")
         text = _text(path, kind.most_bytes)
-        table = _from_json(text, kind) if path.suffix == ".json" else _from_csv(text, kind)
-        return _checked(table, kind)
+        if suffix == ".json":
+            return _checked(_from_json(text, kind), kind)
+        return _checked(sheets.numbers(text, kind.columns, kind.counts[1]), kind)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
 
@@ -154,13 +158,13 @@ def _text(path: Path, most: int) -> str:
         raise ValueError(f"cannot be read ({error.strerror})") from None
     if len(data) > most:
         raise ValueError(f"larger than {most:,} bytes, more than this run's rules could fill")
-    try:
-        return data.decode("utf-8-sig")  # spreadsheets write a mark at the beginning
-    except UnicodeDecodeError:
-        raise ValueError("not a text file in UTF-8") from None
+    return sheets.decode(data)
 
 
 def _from_json(text: str, kind: Schema) -> list[list[float]]:
+    values = 2**10 + kind.counts[1] * (len(kind.low) + 32)  # with comments and others' entries
+    if sum(map(text.count, ",[{")) > values:  # before each value stands one of them
+        raise ValueError(f"more than {values:,} values, no rules of this run have that many")
     try:
         # No whole number is too long for a float, and JSON knows no difference.
         data = json.loads(text, parse_int=float, object_pairs_hook=_object)
@@ -172,14 +176,14 @@ def _from_json(text: str, kind: Schema) -> list[list[float]]:
         raise ValueError(f'not a rule file: "format" must be "{FORMAT}"')
     version, rules = data.get("version"), data.get("rules")
     if type(version) is not float or version != VERSION:
-        raise ValueError(f"version {_show(version)}, this program reads version {VERSION}")
+        raise ValueError(f"version {show(version)}, this program reads version {VERSION}")
     for name in ("agent", "inputs", "outputs"):
         if data.get(name) != kind.head[name]:
             raise ValueError(f"{name} must be {json.dumps(kind.head[name])} for this run")
     if TWICE in data:
-        raise ValueError(f"{_show(data[TWICE])} is there twice")
+        raise ValueError(f"{show(data[TWICE])} is there twice")
     if not isinstance(rules, list):
-        raise ValueError(f"rules must be a list, got {_show(rules)}")
+        raise ValueError(f"rules must be a list, got {show(rules)}")
     n, columns = len(kind.inputs), kind.columns
     fields = {"centre": columns[:n], "width": columns[n : 2 * n], "consequents": columns[2 * n :]}
     return [_rule(rule, f"rule {number}", fields) for number, rule in enumerate(rules, 1)]
@@ -188,18 +192,18 @@ def _from_json(text: str, kind: Schema) -> list[list[float]]:
 def _rule(rule: Any, where: str, fields: dict[str, list[str]]) -> list[float]:
     """The numbers of one rule of a JSON file."""
     if not isinstance(rule, dict):
-        raise ValueError(f"{where}: must be an object, got {_show(rule)}")
+        raise ValueError(f"{where}: must be an object, got {show(rule)}")
     if TWICE in rule:
-        raise ValueError(f"{where}: {_show(rule[TWICE])} is there twice")
+        raise ValueError(f"{where}: {show(rule[TWICE])} is there twice")
     row = []
     for field, names in fields.items():
         values = rule.get(field)
         if not isinstance(values, list) or len(values) != len(names):
-            got = f"{len(values)} values" if isinstance(values, list) else _show(values)
+            got = f"{len(values)} values" if isinstance(values, list) else show(values)
             raise ValueError(f"{where}, {field}: must be a list of {len(names)} numbers, got {got}")
         for name, value in zip(names, values, strict=True):
             if type(value) is not float:
-                raise ValueError(f"{where}, {name}: must be a number, got {_show(value)}")
+                raise ValueError(f"{where}, {name}: must be a number, got {show(value)}")
         row += values
     return row
 
@@ -212,41 +216,6 @@ def _object(pairs: list[tuple[str, Any]]) -> dict[Any, Any]:
     return data
 
 
-def _from_csv(text: str, kind: Schema) -> list[list[float]]:
-    try:
-        lines = [line for line in csv.reader(io.StringIO(text, None), strict=True) if line]
-    except csv.Error as error:
-        raise ValueError(f"not CSV ({error})") from None
-    header, columns = [cell.strip() for cell in lines[0]] if lines else [], kind.columns
-    for name in columns:
-        if (count := header.count(name)) != 1:
-            raise ValueError(f"column {name} is {'there twice' if count else 'missing'}")
-    places, table = [header.index(name) for name in columns], []
-    for number, line in enumerate(lines[1:], 1):
-        if len(line) != len(header):
-            raise ValueError(f"rule {number}: {len(line)} cells, the first line has {len(header)}")
-        try:
-            table.append([float(line[place]) for place in places])
-        except ValueError:
-            name, cell = next(
-                (name, line[place])
-                for name, place in zip(columns, places, strict=True)
-                if not _is_number(line[place])
-            )
-            raise ValueError(
-                f"rule {number}, {name}: must be a number, got {_show(cell)}"
-            ) from None
-    return table
-
-
-def _is_number(cell: str) -> bool:
-    try:
-        float(cell)
-    except ValueError:
-        return False
-    return True
-
-
 def _checked(table: list[list[float]], kind: Schema) -> NDArray[Any]:
     """The table in the network's precision, if every number lies within its bounds."""
     least, most = kind.counts
@@ -254,7 +223,8 @@ def _checked(table: list[list[float]], kind: Schema) -> NDArray[Any]:
         wanted = (
             f"{least} rules, as the fixed network has" if least == most else f"{least} to {most}"
         )
-        raise ValueError(f"{len(table)} rules, must be {wanted}")
+        count = f"more than {most}" if len(table) > most else len(table)
+        raise ValueError(f"{count} rules, must be {wanted}")
     exact = np.array(table)
     with np.errstate(over="ignore"):
         rounded = exact.astype(kind.low.dtype)
@@ -266,12 +236,3 @@ def _checked(table: list[list[float]], kind: Schema) -> NDArray[Any]:
             f"{kind.high[column]:g}, got {exact[rule, column]:g}"
         )
     return rounded
-
-
-def _show(value: Any) -> str:
-    """A value from a file, in a few characters of one line."""
-    if isinstance(value, list | dict):
-        return "a list" if isinstance(value, list) else "an object"
-    if isinstance(value, float):
-        return f"{value:g}"
-    return json.dumps(value)[:60]  # null, true, or text without line ends

@@ -15,6 +15,7 @@ from pathlib import Path
 from joblib import Parallel, delayed
 from tqdm import tqdm
 
+from sofnn_torch.numerals import whole
 from sofnn_torch.runs import directory
 from sofnn_torch.runs.settings import Config
 from sofnn_torch.runs.signals import Interrupted, SignalTrap
@@ -81,7 +82,10 @@ def parse(listed: str) -> list[int]:
     with contextlib.suppress(ValueError):
         for part in listed.split(","):
             low, dash, high = part.partition("-")
-            numbers += range(int(low), int(high if dash else low) + 1)[:MOST]
+            several = range(whole(low), whole(high if dash else low) + 1)[:MOST]
+            if not several:
+                raise ValueError
+            numbers += several
         if numbers and len(set(numbers)) == len(numbers) < MOST:
             return numbers
     raise ValueError(f"--seeds must be a list such as 0-7 or 0,3,5, got {listed!r}")
