@@ -243,6 +243,7 @@ def test_a_restored_trial_that_was_over_is_over():
         ("render_mode", ["ansi", 1, np.array(["human"])]),
         ("model_path", ["no/such/file.xml", 5, b"maze.xml", [], __file__]),
         ("camera", ["side", None, 0]),
+        ("speed", [0.0, -1, math.inf, None, "20"]),
         ("width", [0, -1, 2.5, 9000, None, "480", math.nan]),
         ("height", [0, -1, 2.5, 9000, None, "480", math.nan]),
     ],
