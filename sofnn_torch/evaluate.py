@@ -29,6 +29,7 @@ from scipy import stats
 from sofnn_torch.bounds import Count, Settings, Within
 from sofnn_torch.learners.learner import Learner
 from sofnn_torch.maze.optimum import optimal_steps
+from sofnn_torch.maze.rendering import has_display
 from sofnn_torch.pictures.film import film, gif
 from sofnn_torch.runs import checkpoint, seeding
 from sofnn_torch.runs.directory import same_settings
@@ -82,6 +83,8 @@ def check(options: Options) -> None:
     """
     if options.video and options.video.suffix not in (".mp4", ".gif"):
         raise ValueError(f"--video must end in .mp4 or .gif, got {options.video}")
+    if options.viewer and not has_display():
+        raise ValueError("--viewer needs a display: without one use --video FILE")
     for flag, path in (("--video", options.video), ("--json", options.json)):
         if path and (path.is_dir() or not path.parent.is_dir()):
             raise ValueError(f"{flag} {path}: not a file in an existing directory")

@@ -90,6 +90,23 @@ def test_a_policy_that_never_arrives_still_gets_a_table(capsys):
     assert evaluate.plain(rows["steps_to_goal"]) == {"value": None, "low": None, "high": None}
 
 
+def test_the_table_is_in_the_units_that_it_names(capsys):
+    known = {"pose_error": 0.0123, "pose_error_max": 0.0456, "heading_error": math.pi / 8}
+    rows = evaluate.summarise([replace(RECORD, collisions=3, **known)] * 2, optimum=400)
+    evaluate.Console(width=100).print(evaluate.table(rows))
+    lines = [line.split("│") for line in capsys.readouterr().out.splitlines() if "│" in line]
+    printed = {line[1].strip(): line[2].strip() for line in lines}
+    assert printed == {
+        "trials that reached the goal, %": "100.0",
+        "steps to the goal": "500.0",
+        "over the kinematic optimum": "1.250",
+        "collisions per trial": "3.00",
+        "position error, mean, mm": "12.30",
+        "position error, largest, mm": "45.60",
+        "heading error, mean, degrees": "22.50",
+    }
+
+
 def test_the_command_prints_a_table_and_leaves_the_run_alone(
     trained, tmp_path, monkeypatch, capsys
 ):

@@ -1,6 +1,7 @@
 """The maze as a Gymnasium environment."""
 
 import io
+import itertools
 import math
 
 import gymnasium
@@ -83,6 +84,31 @@ def test_the_goal_ends_the_trial_and_pays_once_reached():
         assert reward == pytest.approx(-0.25 + 1.0 * reached)
         assert not truncated
         assert info["steps"] == (math.ceil((distance - 0.06) / 0.005) if reached else 10)
+
+
+@pytest.mark.parametrize("side", [-1, 1])
+@pytest.mark.parametrize("axis", [0, 1])
+def test_zones_end_where_the_maze_is_drawn(axis, side):
+    env = KheperaMazeEnv(motor_noise=0.0, subgoal_reward=0.5)  # zones of 80 mm, the goal 60 mm
+    zones = [(env.plan.start[:2], 0.08), (env.plan.goal, 0.06)]
+    zones += [(place, 0.08) for place in env.plan.subgoals]
+    assert len(zones) == 4
+    for (centre, radius), beyond in itertools.product(zones, (-0.001, 0.001)):
+        env.reset(seed=0)
+        place = np.array(centre)
+        place[axis] += side * (radius + beyond)
+        env.estimator.fix((0.5, 0.5, 0.0))
+        env.physics.place((*place, 0.0))
+        if env.plan.clearance(*place) < 0.002:
+            continue
+        info = env.step(LEFT)[4]  # which turns on the spot
+        inside = beyond < 0
+        if centre == env.plan.goal:
+            assert info["success"] == inside
+        else:
+            error = math.dist(info["true_pose"][:2], info["estimated_pose"][:2])
+            assert (error < 1e-3) == inside
+            assert info["subgoals"].sum() == (inside and centre != env.plan.start[:2])
 
 
 def test_a_trial_that_reaches_the_goal_in_its_last_step_is_not_cut_off():
@@ -243,6 +269,7 @@ def test_a_restored_trial_that_was_over_is_over():
         ("render_mode", ["ansi", 1, np.array(["human"])]),
         ("model_path", ["no/such/file.xml", 5, b"maze.xml", [], __file__]),
         ("camera", ["side", None, 0]),
+        ("speed", [0.0, -1, math.inf, None, "20"]),
         ("width", [0, -1, 2.5, 9000, None, "480", math.nan]),
         ("height", [0, -1, 2.5, 9000, None, "480", math.nan]),
     ],

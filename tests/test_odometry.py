@@ -9,13 +9,18 @@ import pytest
 from sofnn_torch.maze.env import LEFT, RIGHT, STRAIGHT, KheperaMazeEnv
 from sofnn_torch.maze.odometry import (
     DRAG,
+    FORWARD_SPEED,
+    STEP_LENGTH,
     DeadReckoning,
     MotorNoise,
     advance,
     differential_drive,
+    motion,
+    slide,
+    wheel_speeds,
     wrap_angle,
 )
-from sofnn_torch.maze.robot import default_model_path
+from sofnn_torch.maze.robot import Physics, default_model_path
 
 QUARTER = 0.5 * math.pi
 
@@ -145,6 +150,38 @@ def test_the_robot_slides_as_its_estimate_does(bearing, side):
     slid = math.dist(begin, info["true_pose"][:2])
     assert slid > 0.001
     assert math.hypot(x, y) < 0.002 + 0.04 * slid  # standing still it would be wrong by all of it
+
+
+def test_the_drag_of_the_tyres_is_fitted_to_the_simulated_robot():
+    errors = []
+    for bearing in np.arange(0.5, 1.4, 0.2):  # of the wall, seen from the heading
+        physics = Physics()
+        physics.place((0.5, 0.0276, -QUARTER + bearing))
+        for step in range(15):
+            if step == 5:
+                begin = physics.position()
+            physics.drive(FORWARD_SPEED, FORWARD_SPEED)
+        along, aside = slide(10 * STEP_LENGTH, [-QUARTER - physics.pose()[2]])
+        errors.append(math.hypot(along, aside) / math.dist(begin, physics.position()) - 1.0)
+    assert np.abs(errors).max() < 0.08
+    assert abs(np.mean(errors)) < 0.025  # a tenth more or less of DRAG is 0.03
+
+
+def test_wheel_speeds_and_steering_move_a_robot_alike():
+    # Of the paper: (10, 10), (-4, 4) and (4, -4) mm/s, over 10 mm/s.
+    assert wheel_speeds(0.0) == [1.0, 1.0]
+    assert wheel_speeds(1.0) == pytest.approx([-0.4, 0.4])  # to the left
+    assert wheel_speeds(-1.0) == pytest.approx([0.4, -0.4])
+    forward, turn = motion(np.array([RIGHT, STRAIGHT, LEFT]))
+    assert (forward.tolist(), turn.tolist()) == ([0, 1, 0], [-1, 0, 1])
+    steer = np.array([-1.0, -0.25, 0.0, 0.5, 1.0])
+    forward, turn = motion(steer[:, None])
+    assert turn.tolist() == steer.tolist()
+    wheels = motion(np.array([wheel_speeds(value) for value in steer]))
+    np.testing.assert_allclose(wheels, (forward, turn), atol=1e-15)
+    forward, turn = motion(np.array([[0.2, 1.0], [1.0, 0.2], [-1.0, 1.0], [-0.5, -0.5]]))
+    assert forward == pytest.approx([0.6, 0.6, 0.0, -0.5])
+    assert turn == pytest.approx([1.0, -1.0, 1.0, 0.0])  # no faster than the fastest turn
 
 
 def test_a_literal_estimate_always_moves():

@@ -13,7 +13,7 @@ import pytest
 
 from sofnn_torch.maze import rendering
 from sofnn_torch.maze.env import STRAIGHT, KheperaMazeEnv
-from sofnn_torch.maze.rendering import OffscreenRenderer, RenderingError, Viewer
+from sofnn_torch.maze.rendering import OffscreenRenderer, RenderingError
 from sofnn_torch.maze.robot import load_model
 
 
@@ -167,6 +167,8 @@ def test_egl_is_preferred_then_osmesa(headless):
     headless.delenv("MUJOCO_GL")
     headless.setenv("DISPLAY", ":0")
     assert rendering.choose_backend() == "glfw"
+    headless.setattr(sys, "platform", "darwin")
+    assert rendering.choose_backend() == "cgl"
 
 
 def test_without_opengl_one_line_says_what_to_install(headless):
@@ -178,27 +180,102 @@ def test_without_opengl_one_line_says_what_to_install(headless):
     assert "\n" not in str(error.value)
 
 
-def test_the_viewer_without_a_display_says_so(headless):
-    with pytest.raises(RenderingError, match="display"):
-        Viewer(load_model())
-    with pytest.raises(RenderingError, match="display"):
-        KheperaMazeEnv(render_mode="human").reset()
-
-
-@pytest.mark.parametrize(("backend", "library"), [("egl", "EGL"), ("osmesa", "OSMesa")])
-def test_a_backend_works_although_mujoco_was_imported_before(backend, library):
-    if not (sys.platform == "linux" and ctypes.util.find_library(library)):
-        pytest.skip(f"{library} is not installed")
-    code = """
-import os, mujoco, sys
+LIBRARIES = [("egl", "EGL"), ("osmesa", "OSMesa")]
+MAZE = """
+import os, sys, threading
 os.environ["MUJOCO_GL"] = sys.argv[1]
 import gymnasium
-env = gymnasium.make("sofnn_torch:KheperaMaze-v0", render_mode="rgb_array", width=64, height=64)
-env.reset(seed=0)
-print(env.render().std() > 15)
-env.close()
+
+def maze():
+    env = gymnasium.make(
+        "sofnn_torch:KheperaMaze-v0", render_mode="rgb_array", width=32, height=32
+    )
+    env.reset(seed=0)
+    return env
+
+env = maze()
+expected = env.render()
 """
+
+
+def outcome(code, backend, library):
+    """What a program prints that draws with a backend."""
+    if not (sys.platform == "linux" and ctypes.util.find_library(library)):
+        pytest.skip(f"{library} is not installed")
     variables = {k: v for k, v in os.environ.items() if k not in ("MUJOCO_GL", "PYOPENGL_PLATFORM")}
     command = [sys.executable, "-c", code, backend]
-    run = subprocess.run(command, capture_output=True, text=True, env=variables, check=False)
-    assert run.stdout.strip() == "True" and run.stderr == "", run.stderr
+    run = subprocess.run(command, capture_output=True, text=True, env=variables, timeout=120)
+    assert run.returncode == 0 and run.stderr == "", run.stderr
+    return run.stdout.split("\n")[:-1]
+
+
+@pytest.mark.parametrize(("backend", "library"), LIBRARIES)
+def test_a_backend_works_although_mujoco_was_imported_before(backend, library):
+    code = f"import mujoco{MAZE}env.close()\nprint(expected.std() > 15, maze().render().std() > 15)"
+    assert outcome(code, backend, library) == ["True True"]
+
+
+@pytest.mark.parametrize(("backend", "library"), LIBRARIES)
+def test_any_thread_draws_the_same_and_nothing_need_be_closed(backend, library):
+    code = f"""{MAZE}
+def draw(env):
+    print((env.render() == expected).all(), flush=True)
+
+others = [env, env, maze(), maze()]
+threads = [threading.Thread(target=draw, args=(each,)) for each in others]
+for thread in threads:
+    thread.start()
+for thread in threads:
+    thread.join()
+draw(others[2])  # made in this thread, first drawn in another
+others[3].close()
+env.me = env  # as in a notebook: nothing is deleted before the end
+"""
+    assert outcome(code, backend, library) == ["True"] * 5
+
+
+@pytest.mark.parametrize(("backend", "library"), LIBRARIES)
+def test_after_a_fork_one_line_says_that_it_cannot_draw(backend, library):
+    code = f"""{MAZE}
+if not (child := os.fork()):
+    for draw in (env.render, lambda: maze().render()):
+        try:
+            draw()
+        except ValueError as error:
+            print(type(error).__name__, error, flush=True)
+    env.close()
+    os._exit(7)
+print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), (env.render() == expected).all())
+"""
+    *said, parent = outcome(code, backend, library)
+    assert len(said) == 2 and parent == "7 True"
+    assert all(line.startswith("RenderingError cannot draw") and "spawn" in line for line in said)
+
+
+def test_a_process_that_was_forked_may_end_as_any_other():
+    code = f"{MAZE}\nchild = os.fork()\nif child:\n    print(os.waitpid(child, 0)[1])"
+    assert outcome(code, "egl", "EGL") == ["0"]
+
+
+def test_the_first_to_draw_may_be_a_fork():
+    code = MAZE.replace("env = maze()", "child = os.fork()\nenv = maze()")
+    code += "print(expected.std() > 15, flush=True)\nif child: os.waitpid(child, 0)"
+    assert outcome(code, "egl", "EGL") == ["True", "True"]
+
+
+@needs_gl
+def test_a_closed_renderer_says_so():
+    renderer = OffscreenRenderer(load_model(), 16, 16)
+    renderer.close()
+    renderer.close()
+    with pytest.raises(RenderingError, match="closed"):
+        renderer.draw(load_model().key("start").qpos)
+
+
+@needs_gl
+def test_a_renderer_that_is_forgotten_frees_its_context():
+    renderer = OffscreenRenderer(load_model(), 16, 16)
+    number = len(rendering._contexts)
+    del renderer
+    OffscreenRenderer(load_model(), 16, 16).close()  # waits for what was asked before
+    assert len(rendering._contexts) == number - 1

@@ -217,9 +217,9 @@ def test_the_scattered_start_is_near_the_start_and_seeded():
         for info in infos:
             assert info["estimated_pose"] == pytest.approx(info["true_pose"], abs=1e-9)
         env.close()
-    offset = np.abs(starts[0] - env.unwrapped.plan.start)
-    assert (offset <= 0.5 * np.array(robustness.START_SPREAD) + 1e-9).all()
-    assert (offset.max(0) > 0.3 * np.array(robustness.START_SPREAD)).all()
+    offset = (starts[0] - env.unwrapped.plan.start) / robustness.START_SPREAD
+    assert (np.abs(offset) <= 0.5 + 1e-9).all()
+    assert (offset.max(0) > 0.3).all() and (offset.min(0) < -0.3).all()  # to either side
     assert (starts[0] == starts[1]).all() and (starts[0] != starts[2]).any()
     noisy = robustness.changed_maze(config, {"motor_noise": 0.3}, 0)
     assert noisy.unwrapped.noise.magnitude == 0.3

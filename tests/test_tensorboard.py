@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
+import mujoco
 import numpy as np
 import pytest
 from PIL import Image
@@ -13,7 +14,9 @@ from tensorboard.backend.event_processing import plugin_event_accumulator
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
 
+from sofnn_torch.maze.env import KheperaMazeEnv
 from sofnn_torch.maze.rendering import RenderingError
+from sofnn_torch.maze.robot import default_model_path
 from sofnn_torch.pictures import film as film_module
 from sofnn_torch.pictures.events import EventFile
 from sofnn_torch.pictures.film import film, gif
@@ -246,6 +249,25 @@ def test_a_film_of_a_robot_that_does_not_arrive_ends(sga_trial, monkeypatch):
     config, agent, _, _ = sga_trial
     monkeypatch.setattr(film_module, "OffscreenRenderer", Camera)
     assert len(list(film(config, agent, steps_per_frame=10, limit=50))) <= 7
+
+
+def test_a_film_shows_the_maze_that_the_robot_is_in(sga_trial, monkeypatch, tmp_path):
+    config, agent, _, _ = sga_trial
+    spec = mujoco.MjSpec.from_file(str(default_model_path()))
+    spec.delete(spec.geom("wall_lower"))
+    path = tmp_path / "maze.xml"
+    path.write_text(spec.to_xml())
+    shown = []
+
+    class Screen(Camera):
+        def __init__(self, model, *size):
+            shown.append([model.geom(i).name for i in range(model.ngeom)])
+            super().__init__(model, *size)
+
+    monkeypatch.setattr(film_module, "OffscreenRenderer", Screen)
+    monkeypatch.setattr(film_module, "make_env", lambda _: KheperaMazeEnv(model_path=path))
+    next(film(config, agent))
+    assert "wall_upper" in shown[0] and "wall_lower" not in shown[0]
 
 
 def test_a_gif_has_all_frames():

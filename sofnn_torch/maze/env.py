@@ -20,9 +20,10 @@ from sofnn_torch.maze.odometry import (
     Pose,
     pose_errors,
 )
-from sofnn_torch.maze.rendering import OffscreenRenderer, Viewer
+from sofnn_torch.maze.rendering import OffscreenRenderer
 from sofnn_torch.maze.robot import INFRARED_RANGE, MazePlan, Physics, load_model
 from sofnn_torch.maze.settings import ACTION_NAMES, POSE, MazeConfig
+from sofnn_torch.maze.viewer import Viewer
 from sofnn_torch.network.axes import Axis
 
 __all__ = ["KheperaMazeEnv", "MazePlan", "Physics"]
@@ -74,6 +75,7 @@ class KheperaMazeEnv(gymnasium.Env[np.ndarray, Any]):
         camera: str = "top",
         width: int = 480,
         height: int = 480,
+        speed: float = 20.0,
     ) -> None:
         """Build the environment.
 
@@ -94,9 +96,10 @@ class KheperaMazeEnv(gymnasium.Env[np.ndarray, Any]):
             range_sensors: add 8 infrared ranges and the bumper to the observation.
             render_mode: None, "rgb_array" or "human".
             model_path: another MJCF with the element names of the standard one.
-            camera: "top" or "chase", for "rgb_array".
+            camera: "top" or "chase".
             width: of the picture in pixels.
             height: of the picture in pixels.
+            speed: of the window, times real time.
 
         Raises:
             ValueError: if a setting is unknown or out of range.
@@ -114,6 +117,9 @@ class KheperaMazeEnv(gymnasium.Env[np.ndarray, Any]):
         self.model_path = model_path
         self.camera, self.width, self.height = self.physics.check_view(camera, width, height)
         self.plan = plan = self.physics.plan
+        self.speed = real("speed", speed)
+        if self.speed <= 0.0:
+            raise ValueError(f"speed must be positive, not {speed}")
         self.noise = MotorNoise(motor_noise, wheel_noise)
         self.estimator = DeadReckoning(
             dead_reckoning, WHEEL_BASE * float(wheel_base_scale), self.plan.size
@@ -137,6 +143,8 @@ class KheperaMazeEnv(gymnasium.Env[np.ndarray, Any]):
         zones += [(START, plan.start[:2], plan.start_radius), (GOAL, plan.goal, plan.goal_radius)]
         self._zones = [(zone, (*centre, radius * radius)) for zone, centre, radius in zones]
 
+        self.trial = self.decision = 0  # numbers that the window shows
+        self.caption = ""  # what it shows beside them, e.g. the rule that decides
         self.total_steps = 0
         self.done = True
         self.subgoals = [False] * len(plan.subgoals)
@@ -156,6 +164,7 @@ class KheperaMazeEnv(gymnasium.Env[np.ndarray, Any]):
         pose = self._start_pose(options or {})
         self.physics.place(pose)
         self.estimator.fix(pose)
+        self.trial, self.decision, self.caption = self.trial + 1, 0, ""
         self.total_steps = 0
         self.done = False
         self.subgoals = [False] * len(self.plan.subgoals)
@@ -174,6 +183,7 @@ class KheperaMazeEnv(gymnasium.Env[np.ndarray, Any]):
         if self.done:
             raise gymnasium.error.ResetNeeded("the trial is over: call reset() before step()")
         left, right = self.wheel_speeds(action)
+        self.decision += 1
         # One draw for a whole decision, however early it ends: fast, and easy to reproduce.
         draws = iter(self.np_random.random(2 * self.hold).tolist())
         reward = self.step_reward
@@ -220,12 +230,21 @@ class KheperaMazeEnv(gymnasium.Env[np.ndarray, Any]):
         if self._renderer is None:
             model = load_model(self.model_path)
             if self.render_mode == "human":
-                self._renderer = Viewer(model)
+                self._renderer = Viewer(model, self.speed, self.camera)
             else:
                 self._renderer = OffscreenRenderer(model, self.width, self.height)
         if self.render_mode == "human":
-            return self._renderer.draw(qpos, self.trail, estimate)
+            return self._renderer.draw(qpos, self.trail, estimate, self._texts())
         return self._renderer.draw(qpos, self.trail, estimate, self.camera)
+
+    def _texts(self) -> dict[str, str]:
+        seconds = self.physics.data.time
+        texts = {
+            "trial": f"{self.trial}",
+            "time": f"{seconds:.1f} s",
+            "decision": f"{self.decision}",
+        }
+        return texts | ({"rule": self.caption} if self.caption else {})
 
     def close(self) -> None:
         """Free the renderer or close the viewer window."""

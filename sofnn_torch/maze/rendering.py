@@ -1,14 +1,18 @@
-"""Pictures of the maze: offscreen frames without a display, or MuJoCo's viewer window."""
+"""Pictures of the maze, drawn without a display."""
 
 import atexit
+import contextlib
+import ctypes
 import ctypes.util
 import importlib
 import itertools
 import os
+import queue
 import sys
 import threading
-import time
-from collections.abc import Sequence
+import weakref
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future
 from typing import Any
 
 import mujoco
@@ -21,7 +25,6 @@ TRAIL_COLOUR = (0.05, 0.25, 0.7, 1.0)
 GHOST_COLOUR = (0.85, 0.1, 0.35, 0.55)
 TRAIL_PIECES = 1500  # a longer trail is drawn with fewer points
 MAX_GEOMS = 4000
-SECONDS_PER_FRAME = 0.025  # in the viewer: 20 x real time
 
 # MuJoCo's module, shared library and Debian package of each way to draw.
 BACKENDS = {
@@ -33,7 +36,66 @@ BACKENDS = {
 
 
 class RenderingError(ValueError):
-    """This machine cannot draw; the message says what to install."""
+    """This machine or process cannot draw; the message says what to do."""
+
+
+def check_process(first: int) -> None:
+    """Compare this process with the one that drew first.
+
+    Raises:
+        RenderingError: if it is a fork, in which OpenGL would wait for ever.
+    """
+    if first != os.getpid():
+        raise RenderingError(
+            "cannot draw in a process that was forked from one that has drawn: start it with "
+            'multiprocessing\'s "spawn", or draw in one of them only'
+        )
+
+
+class DrawingThread:
+    """The one thread that calls OpenGL: a context belongs to the thread that has made it.
+
+    So pictures can be asked for in any thread, also in several at once.
+    """
+
+    def __init__(self) -> None:
+        """Start nothing yet: a process that has not drawn can be forked."""
+        self._jobs: queue.SimpleQueue = queue.SimpleQueue()
+        self._starting = threading.Lock()
+        self._process: int | None = None
+
+    def post(self, job: Callable[..., Any], *arguments: Any) -> Future:
+        """Have a job done, without waiting for it.
+
+        Raises:
+            RenderingError: after a fork.
+        """
+        with self._starting if self._process is None else contextlib.nullcontext():
+            if self._process is None:
+                self._process = os.getpid()
+                # A daemon still works while functions of `atexit` are called.
+                threading.Thread(target=self._work, name="drawing", daemon=True).start()
+        check_process(self._process)
+        future: Future = Future()
+        self._jobs.put((future, job, arguments))
+        return future
+
+    def call(self, job: Callable[..., Any], *arguments: Any) -> Any:
+        """Have a job done and return its result, or raise its exception."""
+        return self.post(job, *arguments).result()
+
+    def _work(self) -> None:
+        while True:
+            future, job, arguments = self._jobs.get()
+            try:
+                future.set_result(job(*arguments))
+            except Exception as error:
+                future.set_exception(error)
+            del future, job, arguments  # while it waits it must keep nothing alive
+
+
+_thread = DrawingThread()
+_contexts: dict[int, tuple[Any, Any]] = {}  # those that are open, by the number of the first
 
 
 def has_display() -> bool:
@@ -52,11 +114,11 @@ def choose_backend() -> str:
     Raises:
         RenderingError: if there is no display and neither library is installed.
     """
+    if sys.platform == "darwin":
+        return "cgl"  # windows belong to the main thread there
     wanted = os.environ.get("MUJOCO_GL", "").lower().strip()
     if wanted in BACKENDS:
         return wanted
-    if sys.platform == "darwin":
-        return "cgl"
     if has_display():
         return "glfw"
     for name in ("egl", "osmesa"):
@@ -69,7 +131,7 @@ def choose_backend() -> str:
 
 
 def create_context(model: mujoco.MjModel, width: int, height: int) -> tuple[Any, mujoco.MjrContext]:
-    """Create an offscreen OpenGL context, and MuJoCo's resources for a model in it.
+    """Create an offscreen OpenGL context in this thread, and MuJoCo's resources for a model in it.
 
     Unlike `mujoco.Renderer`, which looks at MUJOCO_GL only when `mujoco` is first imported, this
     works in whatever order modules were imported.
@@ -84,6 +146,7 @@ def create_context(model: mujoco.MjModel, width: int, height: int) -> tuple[Any,
         gl.make_current()
         context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, context)
+        _contexts[id(gl)] = (gl, context)
         return gl, context
     except Exception as error:  # backends raise all kinds, down to AttributeError
         hint = f" (Debian: apt install {package})" if package else ""
@@ -92,6 +155,30 @@ def create_context(model: mujoco.MjModel, width: int, height: int) -> tuple[Any,
             f"cannot draw with {backend}{hint}: {reason}; "
             "the environment variable MUJOCO_GL chooses another way: egl, osmesa or glfw"
         ) from error
+
+
+def free_context(gl: Any, context: mujoco.MjrContext) -> None:
+    """Free what `create_context` has created."""
+    _contexts.pop(id(gl), None)
+    gl.make_current()
+    context.free()
+    if type(gl).__module__ == "mujoco.osmesa":
+        # PyOpenGL cannot pass on the missing buffer with which MuJoCo lets the context go.
+        library = ctypes.CDLL(ctypes.util.find_library("OSMesa"))
+        library.OSMesaMakeCurrent(None, None, 0, 0, 0)
+    gl.free()
+
+
+def _forget_contexts() -> None:
+    """In a forked process, leave the contexts to the one that owns them."""
+    for resource in itertools.chain(*_contexts.values()):
+        ctypes.pythonapi.Py_IncRef(ctypes.py_object(resource))  # deleted, it would call OpenGL
+    if "mujoco.egl" in sys.modules:
+        sys.modules["mujoco.egl"].EGL_DISPLAY = None  # as would MuJoCo at exit
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_forget_contexts)
 
 
 class OffscreenRenderer:
@@ -116,7 +203,14 @@ class OffscreenRenderer:
         self._option = mujoco.MjvOption()
         self._option.flags[mujoco.mjtVisFlag.mjVIS_RANGEFINDER] = False
         self._viewport = mujoco.MjrRect(0, 0, width, height)
-        self._gl, self._context = create_context(model, width, height)
+        gl, self._context = _thread.call(create_context, model, width, height)
+        self._free = weakref.finalize(self, _thread.post, free_context, gl, self._context)
+        self._free.atexit = False
+        self._gl = gl
+        _open.add(self)
+        # Later than MuJoCo's own function, so that it is called before.
+        atexit.unregister(_close_all)
+        atexit.register(_close_all)
 
     def draw(
         self,
@@ -137,14 +231,26 @@ class OffscreenRenderer:
             RGB array (height, width, 3).
 
         Raises:
+            RenderingError: if the renderer is closed, or this process a fork of its own.
             ValueError: if the model has no such camera.
         """
+        if not self._free.alive:
+            raise RenderingError("cannot draw with a renderer that is closed")
         view = mujoco.MjvCamera()
         view.type = mujoco.mjtCamera.mjCAMERA_FIXED
         view.fixedcamid = mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_CAMERA, camera)
         if view.fixedcamid < 0:
             names = [self.model.camera(i).name for i in range(self.model.ncam)]
             raise ValueError(f"camera must be one of {names}, not {camera!r}")
+        return _thread.call(self._draw, np.array(qpos), list(trail), estimate, view)
+
+    def _draw(
+        self,
+        qpos: NDArray[np.float64],
+        trail: list[tuple[float, float]],
+        estimate: Pose | None,
+        view: mujoco.MjvCamera,
+    ) -> NDArray[np.uint8]:
         self.data.qpos[:] = qpos
         mujoco.mj_kinematics(self.model, self.data)
         mujoco.mj_comPos(self.model, self.data)
@@ -161,68 +267,18 @@ class OffscreenRenderer:
         return pixels[::-1].copy()
 
     def close(self) -> None:
-        """Free the OpenGL context."""
-        if self._gl is not None:
-            self._gl.make_current()
-            self._context.free()
-            self._gl.free()
-            self._gl = None
+        """Free the OpenGL context; a renderer that is deleted or open at the end does so itself."""
+        with contextlib.suppress(RenderingError):  # a fork leaves it to its owner
+            if (freed := self._free()) is not None:
+                freed.result()
 
 
-class Viewer:
-    """MuJoCo's interactive viewer, following a simulation that runs elsewhere."""
+_open: weakref.WeakSet[OffscreenRenderer] = weakref.WeakSet()
 
-    def __init__(self, model: mujoco.MjModel) -> None:
-        """Open the window.
 
-        Raises:
-            RenderingError: if there is no display, or on macOS outside `mjpython`.
-        """
-        if not has_display():
-            raise RenderingError(
-                'the viewer needs a display; without one use render_mode="rgb_array" or a video'
-            )
-        import mujoco.viewer  # needs GLFW, so only now
-
-        self._model = model
-        self.data = mujoco.MjData(model)
-        others = set(threading.enumerate())
-        try:
-            self._handle = mujoco.viewer.launch_passive(
-                model, self.data, show_left_ui=False, show_right_ui=False
-            )
-        except RuntimeError as error:
-            raise RenderingError(str(error)) from error
-        self._threads = set(threading.enumerate()) - others
-        mujoco.mjv_defaultFreeCamera(model, self._handle.cam)
-        self._handle.opt.flags[mujoco.mjtVisFlag.mjVIS_RANGEFINDER] = False
-        self._next_frame = 0.0
-        atexit.register(self.close)
-
-    def draw(
-        self,
-        qpos: NDArray[np.float64],
-        trail: Sequence[tuple[float, float]] = (),
-        estimate: Pose | None = None,
-    ) -> None:
-        """Show a new state; arguments as in `OffscreenRenderer.draw`."""
-        if not self._handle.is_running():
-            return
-        with self._handle.lock():
-            self.data.qpos[:] = qpos
-            mujoco.mj_forward(self._model, self.data)
-            self._handle.user_scn.ngeom = 0
-            decorate(self._handle.user_scn, trail, estimate)
-        self._handle.sync()
-        time.sleep(max(0.0, self._next_frame - time.monotonic()))
-        self._next_frame = time.monotonic() + SECONDS_PER_FRAME
-
-    def close(self) -> None:
-        """Close the window, and wait for its thread: ending Python before it would crash."""
-        atexit.unregister(self.close)
-        self._handle.close()
-        for thread in self._threads:
-            thread.join(timeout=5.0)
+def _close_all() -> None:
+    for renderer in list(_open):
+        renderer.close()
 
 
 def decorate(

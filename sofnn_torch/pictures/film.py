@@ -41,7 +41,7 @@ def film(
         RenderingError: this machine cannot draw.
     """
     env = make_env(config)
-    renderer = OffscreenRenderer(load_model(), size, size)
+    renderer = OffscreenRenderer(load_model(env.unwrapped.model_path), size, size)
     for effect in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
         renderer.scene.flags[effect] = 0  # four fifths of the time where there is no GPU
     trail: list[tuple[float, float]] = []
