@@ -11,6 +11,7 @@ from sofnn_torch.learners.frozen import FrozenPolicy
 from sofnn_torch.maze.rendering import OffscreenRenderer
 from sofnn_torch.maze.robot import load_model
 from sofnn_torch.pictures import figures
+from sofnn_torch.runs import seeding
 from sofnn_torch.runs.factory import make_env
 from sofnn_torch.terminal import command
 
@@ -33,7 +34,8 @@ def main(options: Options) -> None:
     renderer = OffscreenRenderer(load_model(), SIZE, SIZE)
     trail: list[tuple[float, float]] = []
     env.on_simulator_step = lambda: trail.append(env.physics.position())
-    observation, _ = env.reset(seed=1000)
+    seeding.begin(env, agent, 1000)
+    observation, _ = env.reset()  # the first trial that `evaluate` plays
     policy, over, close_up = FrozenPolicy(agent), False, None
     while not over:
         observation, _, terminated, truncated, _ = env.step(policy.act(observation))

@@ -30,7 +30,7 @@ from sofnn_torch.bounds import Count, Settings, Within
 from sofnn_torch.learners.learner import Learner
 from sofnn_torch.maze.optimum import optimal_steps
 from sofnn_torch.pictures.film import film, gif
-from sofnn_torch.runs import checkpoint
+from sofnn_torch.runs import checkpoint, seeding
 from sofnn_torch.runs.directory import same_settings, versions
 from sofnn_torch.runs.factory import make_agent, make_env
 from sofnn_torch.runs.session import arithmetic, saved_config
@@ -151,8 +151,7 @@ def evaluate(
     """
     env = make_env(config, render_mode=render_mode)
     try:
-        env.reset(seed=seed)
-        agent.reseed(seed)
+        seeding.begin(env, agent, seed)
         records = []
         for trial in range(1, episodes + 1):
             record, _ = play(env, agent, learn=False, explore=explore)

@@ -18,13 +18,13 @@ from sofnn_torch.maze.env import KheperaMazeEnv
 from sofnn_torch.pictures.tensorboard import Monitor
 from sofnn_torch.runs import checkpoint, session
 from sofnn_torch.runs.guard import Divergence, Watch
-from sofnn_torch.runs.session import RunOptions, Session, arithmetic, environment_seed
+from sofnn_torch.runs.session import RunOptions, Session, arithmetic
 from sofnn_torch.runs.settings import Config, from_dict
 from sofnn_torch.runs.signals import Interrupted, SignalTrap
 from sofnn_torch.runs.trial import Recorder, Trajectory, TrialRecord
 from sofnn_torch.terminal import plural, say
 
-__all__ = ["RunOptions", "environment_seed", "play", "replay", "resume", "train"]
+__all__ = ["RunOptions", "play", "replay", "resume", "train"]
 
 
 def play(

@@ -18,6 +18,7 @@ from sofnn_torch.pictures import film as film_module
 from sofnn_torch.pictures.events import EventFile
 from sofnn_torch.pictures.film import film, gif
 from sofnn_torch.pictures.tensorboard import Monitor
+from sofnn_torch.runs import seeding
 from sofnn_torch.runs.factory import make_agent, make_env
 from sofnn_torch.runs.settings import Config
 from sofnn_torch.runs.trial import Trajectory
@@ -227,8 +228,7 @@ class Camera:
 def test_the_film_shows_the_trial_that_evaluation_plays(sga_trial, monkeypatch):
     config, agent, _, _ = sga_trial
     env = make_env(config)
-    env.reset(seed=5)
-    agent.rng = np.random.default_rng(5)
+    seeding.begin(env, agent, 5)
     _, path = play(env, agent, learn=False, explore=False)
     env.close()
     before_film = agent.rng.bit_generator.state

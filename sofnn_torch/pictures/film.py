@@ -12,6 +12,7 @@ from sofnn_torch.learners.frozen import FrozenPolicy
 from sofnn_torch.learners.learner import Learner
 from sofnn_torch.maze.rendering import OffscreenRenderer
 from sofnn_torch.maze.robot import load_model
+from sofnn_torch.runs import seeding
 from sofnn_torch.runs.factory import make_env
 from sofnn_torch.runs.settings import Config
 
@@ -30,7 +31,7 @@ def film(
     Args:
         config: settings of the run.
         agent: the learner.
-        seed: seed of the motor noise.
+        seed: seed of the motor noise and of the policy's chance.
         explore: sample the stochastic policy.
         steps_per_frame: simulator steps from one frame to the next.
         limit: steps after which the film ends.
@@ -55,9 +56,8 @@ def film(
             shoot()
 
     rng = agent.rng  # a film must not change the training
-    agent.reseed(seed)
     try:
-        env.reset(seed=seed)
+        seeding.begin(env, agent, seed)
         policy = FrozenPolicy(agent, explore)
         observation, _ = env.reset()  # as in a series of trials, where only the first is seeded
         env.on_simulator_step, over = after_step, False

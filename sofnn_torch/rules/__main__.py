@@ -30,7 +30,7 @@ from sofnn_torch.learners.learner import Learner
 from sofnn_torch.pictures import figures
 from sofnn_torch.rules import files, words
 from sofnn_torch.rules.words import Decision, Reading, number
-from sofnn_torch.runs import checkpoint
+from sofnn_torch.runs import checkpoint, seeding
 from sofnn_torch.runs.directory import Run, first_free
 from sofnn_torch.runs.factory import make_env
 from sofnn_torch.runs.session import RunOptions, arithmetic, home_of
@@ -97,8 +97,7 @@ def firing_along_a_trial(
     """Share of each rule (K,) in a trial without learning, its decisions, and how it went."""
     env = make_env(config)
     try:
-        env.reset(seed=seed)
-        agent.reseed(seed)
+        seeding.begin(env, agent, seed)
         record, path = play(env, agent, learn=False, explore=False)
     finally:
         env.close()

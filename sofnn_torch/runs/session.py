@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 import torch
 
 from sofnn_torch.bounds import Count, Settings, Within
@@ -17,6 +16,7 @@ from sofnn_torch.runs import checkpoint
 from sofnn_torch.runs.checkpoint import CheckpointError
 from sofnn_torch.runs.directory import Run, load_config, same_settings
 from sofnn_torch.runs.factory import make_agent, make_env
+from sofnn_torch.runs.seeding import stream
 from sofnn_torch.runs.settings import Config, from_dict
 from sofnn_torch.runs.trial import TrialRecord
 
@@ -189,13 +189,8 @@ def build(config: Config) -> tuple[Learner, KheperaMazeEnv]:
         ValueError: settings that do not go together.
     """
     agent, env = make_agent(config), make_env(config)
-    env.reset(seed=environment_seed(config))
+    env.reset(seed=stream("training", config.seed))
     return agent, env
-
-
-def environment_seed(config: Config) -> int:
-    """Seed of the maze, apart from the agent's: equal seeds would draw equal numbers."""
-    return int(np.random.SeedSequence([config.seed, 1]).generate_state(1)[0])
 
 
 def saved_config(path: Path) -> Config:

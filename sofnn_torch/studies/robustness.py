@@ -9,6 +9,7 @@ import gymnasium
 import numpy as np
 
 from sofnn_torch import evaluate
+from sofnn_torch.runs import seeding
 from sofnn_torch.runs.factory import make_env
 from sofnn_torch.runs.settings import Config
 from sofnn_torch.training import play
@@ -34,7 +35,7 @@ class ScatteredStart(gymnasium.Wrapper):
 
     def __init__(self, env: gymnasium.Env, spread: float, seed: int):
         super().__init__(env)
-        self.spread, self.rng = spread, np.random.default_rng(seed)
+        self.spread, self.rng = spread, np.random.default_rng(seeding.stream("start", seed))
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
         """Begin a trial; the robot is told where it stands, as at every pass of the start."""
@@ -63,8 +64,7 @@ def under_conditions(path: Path) -> list[dict[str, Any]]:
             for policy in ("greedy", "sampled"):
                 seed = 2000 + config.seed
                 env = changed_maze(config, change, seed)
-                env.reset(seed=seed)
-                agent.reseed(seed)
+                seeding.begin(env, agent, seed)
                 records = [
                     play(env, agent, learn=False, explore=policy == "sampled")[0]
                     for _ in range(EPISODES)
