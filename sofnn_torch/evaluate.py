@@ -31,8 +31,9 @@ from sofnn_torch.learners.learner import Learner
 from sofnn_torch.maze.optimum import optimal_steps
 from sofnn_torch.pictures.film import film, gif
 from sofnn_torch.runs import checkpoint, seeding
-from sofnn_torch.runs.directory import same_settings, versions
+from sofnn_torch.runs.directory import same_settings
 from sofnn_torch.runs.factory import make_agent, make_env
+from sofnn_torch.runs.provenance import versions
 from sofnn_torch.runs.session import arithmetic, saved_config
 from sofnn_torch.runs.settings import Config
 from sofnn_torch.runs.trial import TrialRecord

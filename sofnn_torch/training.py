@@ -76,7 +76,7 @@ def train(config: Config, options: RunOptions | None = None) -> Path:
         OSError: the disk refused the last checkpoint; the message says where it is instead.
     """
     options = options or RunOptions()
-    with SignalTrap() as trap, arithmetic(options.threads):
+    with SignalTrap() as trap, arithmetic(options.threads, options.portable):
         return _loop(session.begin(config, options), options, trap)
 
 
@@ -94,7 +94,7 @@ def resume(path: Path | str, options: RunOptions | None = None, trials: int | No
         ValueError, Interrupted, Divergence, OSError: as `train`.
     """
     options = options or RunOptions()
-    with SignalTrap() as trap, arithmetic(options.threads):
+    with SignalTrap() as trap, arithmetic(options.threads, options.portable):
         reopened = session.reopen(Path(path), options, trials)
         if reopened.trial == reopened.run.config.trials:
             reopened.close()

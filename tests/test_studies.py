@@ -434,8 +434,11 @@ def test_data_of_runs_become_a_page(tmp_path, monkeypatch):
         runs, ["growth"], "sga-rule", [0, 1], {"trials": 2, "maze.max_steps": 30}
     ):
         assert done(work) == 0
+    (runs / "growth-sga-rule-s1" / running.PLAYED).write_text('[{"instructions": "AVX7"}]')
     assert command.run(command.Options(**options)) == 0
     data = results.read(out, "growth")
+    trained, played = data.info["versions"]
+    assert trained["instructions"] != played["instructions"] == "AVX7"
     assert data.column("sga-rule", "seed").tolist() == [0, 1]
     assert data.column("sga-rule", "total_steps").tolist() == [60, 60]
     assert [curve.tolist() for curve in data.curves("sga-rule", "steps")] == [[30, 30]] * 2

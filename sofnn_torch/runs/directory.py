@@ -241,9 +241,14 @@ class Run:
         if former == {"versions": versions(), "commit": commit()}:
             return
         self.earlier.append(former)
-        for name, now in versions().items():
-            if (then := former["versions"].get(name)) != now:
-                say(f"warning: {name} was {then}, is {now}: numbers may differ in the last bits")
+        then = former["versions"]
+        others = [
+            f"{name} was {then.get(name, 'unknown')}, is {now}"
+            for name, now in versions().items()
+            if then.get(name) != now
+        ]
+        if others:
+            say(f"warning: {'; '.join(others)}: numbers may differ in the last bits")
 
     def _write_settings(self) -> None:
         text = json.dumps(

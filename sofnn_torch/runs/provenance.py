@@ -1,7 +1,10 @@
-"""Which software made a result."""
+"""Which software and which processor made a result, and how to make the latter not matter."""
 
 import contextlib
+import functools
+import os
 import platform
+import re
 import subprocess
 from pathlib import Path
 
@@ -12,9 +15,14 @@ import torch
 
 import sofnn_torch
 
+# Torch and MKL choose their instructions by the processor, and sum in another order with each.
+# AVX2 for torch's own kernels, and the branch of MKL that is the same on all makes of processors.
+PORTABLE = {"ATEN_CPU_CAPABILITY": "avx2", "MKL_CBWR": "COMPATIBLE"}
+
 
 def versions() -> dict[str, str]:
-    """Versions and number of threads: all that the last bits of a result depend on."""
+    """Versions, processor and arithmetic: all that the last bits of a result depend on."""
+    flushed = bool(torch.tensor(1e-30) * 1e-10 == 0)
     return {
         "sofnn_torch": sofnn_torch.__version__,
         "python": platform.python_version(),
@@ -24,7 +32,46 @@ def versions() -> dict[str, str]:
         "gymnasium": gymnasium.__version__,
         "threads": str(torch.get_num_threads()),
         "machine": f"{platform.system()} {platform.machine()}",
+        "processor": _processor(),
+        "instructions": torch.backends.cpu.get_cpu_capability(),
+        "blas": _blas(),
+        "denormals": "flushed" if flushed else "kept",
     }
+
+
+@functools.cache
+def _processor() -> str:
+    """Name of the processor; MKL also goes by its make."""
+    with contextlib.suppress(OSError):
+        text = Path("/proc/cpuinfo").read_text()
+        if found := re.search(r"model name\s*: (.+)", text):
+            return found[1].strip()
+    return platform.processor() or "unknown"
+
+
+@functools.cache
+def _blas() -> str:
+    """Library of matrix products, and its branch if one was asked for."""
+    text = torch.__config__.show()
+    if found := re.search(r"Math Kernel Library Version (\S+)", text):
+        branch = os.environ.get("MKL_CBWR")
+        return f"MKL {found[1]}" + f", {branch}" * bool(branch)
+    found = re.search(r"BLAS_INFO=(\w+)", text)
+    return found[1] if found else "unknown"
+
+
+def make_portable() -> None:
+    """From now on compute what any x86-64 processor with AVX2 would, to the last bit.
+
+    Raises:
+        ValueError: this processor has no AVX2, or torch has computed something already.
+    """
+    if not getattr(torch.cpu, "_is_avx2_supported", lambda: True)():
+        raise ValueError("--portable needs a processor with AVX2 instructions")
+    os.environ.update(PORTABLE)  # both libraries read it when they compute for the first time
+    if torch.backends.cpu.get_cpu_capability() != "AVX2":
+        words = " ".join(f"{name}={value}" for name, value in PORTABLE.items())
+        raise ValueError(f"torch has computed already: start with {words} in the environment")
 
 
 def commit() -> str | None:

@@ -16,6 +16,7 @@ from sofnn_torch.runs import checkpoint
 from sofnn_torch.runs.checkpoint import CheckpointError
 from sofnn_torch.runs.directory import Run, load_config, same_settings
 from sofnn_torch.runs.factory import make_agent, make_env
+from sofnn_torch.runs.provenance import make_portable
 from sofnn_torch.runs.seeding import stream
 from sofnn_torch.runs.settings import Config, from_dict
 from sofnn_torch.runs.trial import TrialRecord
@@ -28,7 +29,7 @@ WINDOW = 10  # trials that decide which checkpoint is the best
 
 @dataclass(frozen=True)
 class RunOptions(Settings):
-    """How a run is kept and shown; nothing here but `threads` changes what is learned."""
+    """How a run is kept and shown; nothing here but `threads` and `portable` changes bits."""
 
     runs: Path = Path("runs")
     """Directory of all runs."""
@@ -45,6 +46,9 @@ class RunOptions(Settings):
     threads: Annotated[Count, Within(most=MOST_THREADS)] = 1
     """Threads of torch; one is fastest at this size. Results with replay or with several thousand
     rules differ in their last bits between one and more."""
+    portable: bool = False
+    """Compute the same bits on every x86-64 processor with AVX2, whatever else it has. Not the bits
+    of runs without this; the speed is about the same."""
     quiet: bool = False
     """No progress bar."""
 
@@ -108,13 +112,22 @@ class Session:
 
 
 @contextlib.contextmanager
-def arithmetic(threads: int = 1) -> Iterator[None]:
+def arithmetic(threads: int = 1, portable: bool = False) -> Iterator[None]:
     """Set torch's number of threads; inside, results below 1e-38 count as 0. Also a decorator.
 
     Firing strengths and traces far from the state are full of such denormal numbers, for which
     processors take many times as long. Nor does memory go back to the system after each batch: new
     pages cost as much as the arithmetic on them.
+
+    Args:
+        threads: of torch.
+        portable: compute the same bits on every processor with AVX2, until the process ends.
+
+    Raises:
+        ValueError: the processor has no AVX2, or torch has computed something already.
     """
+    if portable:
+        make_portable()
     flushed, former = bool(torch.tensor(1e-30) * 1e-10 == 0), torch.get_num_threads()
     torch.set_flush_denormal(True)  # first: threads inherit it when they are made
     torch.set_num_threads(threads)

@@ -14,7 +14,7 @@ import numpy as np
 from sofnn_torch.pictures.figures import read_column
 from sofnn_torch.runs.settings import Config
 from sofnn_torch.studies.results import write_table
-from sofnn_torch.studies.running import EPISODES, find_runs
+from sofnn_torch.studies.running import EPISODES, PLAYED, find_runs
 from sofnn_torch.studies.studies import STUDIES, changed, essence, settings
 
 IN_A_ROW, WITHIN = 10, 1.5  # learned: so many trials in a row under so many times the optimum
@@ -42,7 +42,7 @@ def collect(
         if (path / "evaluation.json").exists():
             anonymous = dataclasses.replace(config, seed=0)
             of_arm.setdefault(anonymous, []).append((config.seed, path))
-    arms, spans, sources = {}, [], []
+    arms, spans, sources, played = {}, [], [], []
     for arm, entries in study.arms.items():
         config = settings(entries | changes)
         found = sorted(of_arm.get(essence(config), []))
@@ -60,6 +60,8 @@ def collect(
             spans.append((path, row["wall_seconds"], row["cpu_seconds"]))
             source = json.loads((path / "config.json").read_text())
             sources += [source, *source.get("earlier", [])]
+            if (path / PLAYED).exists():
+                played += json.loads((path / PLAYED).read_text())
             tables["curves"] += [key | curve for curve in _curves(path)]
             if study.figures:
                 tables["paths"] += [key | point for point in _path(path)]
@@ -87,7 +89,7 @@ def collect(
         "wall_seconds": round(sum(wall for wall, _ in seconds.values())),
         "cpu_seconds": round(sum(cpu for _, cpu in seconds.values())),
         "commits": _distinct(source["commit"] for source in sources),
-        "versions": _distinct(source["versions"] for source in sources),
+        "versions": _distinct([*(source["versions"] for source in sources), *played]),
         "arms": arms,
     }
     file.write_text(json.dumps(summary, indent=1) + "\n")

@@ -19,6 +19,7 @@ from sofnn_torch.pictures.figures import read_column
 from sofnn_torch.runs import checkpoint, directory, session
 from sofnn_torch.runs.guard import Divergence
 from sofnn_torch.runs.parallel import watch
+from sofnn_torch.runs.provenance import versions
 from sofnn_torch.runs.session import arithmetic
 from sofnn_torch.runs.settings import Config, from_dict
 from sofnn_torch.runs.signals import Interrupted, SignalTrap
@@ -28,6 +29,7 @@ from sofnn_torch.studies.studies import STUDIES, essence, settings
 from sofnn_torch.terminal import say
 
 EPISODES = 10  # evaluation trials of a run, for each policy
+PLAYED = "played-with.json"  # versions of the software, and the processor
 WORK = "import sys; from sofnn_torch.studies.running import work; sys.exit(work(*sys.argv[1:]))"
 
 
@@ -133,12 +135,15 @@ def work(directory: str, text: str, conditions: str = "") -> int:
     """Train, evaluate and play in other conditions what is not done yet; the exit code."""
     path, config = Path(directory), from_dict(json.loads(text))
     wall, cpu, code = time.perf_counter(), time.process_time(), 0
+    done = Job(path, config, bool(conditions)).done()
     try:
         if not (path / "evaluation.json").exists():
             _write(path / "evaluation.json", _train_and_evaluate(path, config))
         if conditions and not (path / "conditions.json").exists():
             diverged = "diverged" in json.loads((path / "evaluation.json").read_bytes())
             _write(path / "conditions.json", [] if diverged else under_conditions(path))
+        if not done:
+            _note_versions(path / PLAYED)
     except (ValueError, OSError, ArithmeticError) as error:
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
         code = 2
@@ -192,6 +197,13 @@ def last_trial(path: Path) -> tuple[TrialRecord, Trajectory]:
         record, trajectory = training.play(env, agent)
     env.close()
     return record, trajectory
+
+
+def _note_versions(file: Path) -> None:
+    """With what policies were played: it may be another machine than the one that trained."""
+    known = json.loads(file.read_bytes()) if file.exists() else []
+    if (here := versions()) not in known:
+        _write(file, [*known, here])
 
 
 def _write(path: Path, data: Any) -> None:
