@@ -1,7 +1,7 @@
 """The command line of training: flags, one clear line for what is wrong, exit codes.
 
-Exit codes: 0 done, 1 diverged or not saved where it should be, 2 bad input, 130 and 143 stopped
-by SIGINT and SIGTERM after saving.
+Exit codes: 0 done, 1 diverged or not saved where it should be, 2 bad input, 128 + n stopped by
+signal n after saving (130 SIGINT, 143 SIGTERM, 129 SIGHUP, 138 SIGUSR1 on Linux).
 """
 
 import argparse
@@ -20,12 +20,11 @@ if __name__ == "__main__":  # Ctrl-C while libraries load: there is nothing to s
 
 from sofnn_torch import training
 from sofnn_torch.bounds import Count, Settings
-from sofnn_torch.runs import directory, parallel
+from sofnn_torch.runs import checkpoint, directory, parallel
 from sofnn_torch.runs.guard import Divergence
 from sofnn_torch.runs.session import RunOptions, home_of, saved_config
 from sofnn_torch.runs.settings import Config
-from sofnn_torch.runs.signals import Interrupted
-from sofnn_torch.terminal import output, say
+from sofnn_torch.terminal import attempt, plural, program, quoted
 from sofnn_torch.terminal import parse as parse_flags
 
 EXAMPLES = """Train a robot to find its way with a self-organizing fuzzy neural network.
@@ -57,30 +56,46 @@ class Flags(Settings):
     """Play the trial again that follows a saved state, such as a `divergence-12.pt`."""
 
 
+FAILURES = {ValueError: 2, Divergence: 1, OSError: 1}
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Train as the flags say; the exit code."""
-    argv = list(sys.argv[1:] if argv is None else argv)
-    try:
-        with output():
-            flags = parse(argv)
-            if flags.replay:
-                training.replay(flags.replay)
-            elif flags.seeds is not None:
-                return parallel.train(flags.config, flags.options, flags.seeds, flags.workers, argv)
-            elif flags.resume:
-                run = training.resume(flags.resume, flags.options, flags.config.trials)
-                print(f"{run}: done")
-            else:
-                print(f"{training.train(flags.config, flags.options)}: done")
-    except ValueError as error:
-        return _fail(error, 2)
-    except (Divergence, OSError) as error:
-        return _fail(error, 1)
-    except Interrupted as stop:
-        if stop.run:
-            say(f"stopped and saved; go on with: {_program()} --resume {stop.run}")
-        return 128 + stop.number
+    words = list(sys.argv[1:] if argv is None else argv)
+    return attempt(lambda: _train(words), FAILURES)
+
+
+def _train(argv: list[str]) -> int:
+    flags = parse(argv)
+    if flags.replay:
+        training.replay(flags.replay)
+        return 0
+    if flags.seeds is not None:
+        return parallel.train(flags.config, flags.options, flags.seeds, flags.workers, argv)
+    if flags.resume:
+        run = training.resume(flags.resume, flags.options, flags.config.trials)
+    else:
+        run = training.train(flags.config, flags.options)
+    print(f"{run}: done")
+    if not flags.options.quiet:
+        print(_achieved(run))
     return 0
+
+
+def _achieved(run: Path) -> str:
+    """What a training reached in its last trials, and the commands to see more of it."""
+    _, state, _ = checkpoint.find_latest(run)
+    recent, rules = state["recent"], plural(state["network"]["rules"], "rule")
+    arrived = [steps for success, steps in recent if success]
+    steps = f", {sum(arrived) / len(arrived):,.0f} steps on average" if arrived else ""
+    lines = [
+        f"goal in {len(arrived)} of the last {plural(len(recent), 'trial')}{steps}; {rules}",
+        "next:",
+        f"  {program('evaluate')} {quoted(run)}",
+        f"  {program('rules')} {quoted(run)}",
+        f"  tensorboard --logdir {quoted(run.parent)}",
+    ]
+    return "\n".join(lines)
 
 
 def parse(argv: Sequence[str]) -> Flags:
@@ -158,16 +173,6 @@ def _changes(ours: Any, theirs: Any) -> list[str]:
 
 def _flag(name: str) -> str:
     return f"--{name}".replace("_", "-")
-
-
-def _program() -> str:
-    name = Path(sys.argv[0]).name
-    return name if name.startswith("sofnn") else "python train.py"
-
-
-def _fail(error: Exception, code: int) -> int:
-    print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
-    return code
 
 
 if __name__ == "__main__":

@@ -13,13 +13,16 @@ directory is not changed.
 import dataclasses
 import json
 import math
+import signal
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
-import imageio.v2 as imageio
+if __name__ == "__main__":  # Ctrl-C while libraries load
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
 import numpy as np
 import tyro
 from rich.console import Console
@@ -30,7 +33,8 @@ from sofnn_torch.bounds import Count, Settings, Within
 from sofnn_torch.learners.learner import Learner
 from sofnn_torch.maze.optimum import optimal_steps
 from sofnn_torch.maze.rendering import has_display
-from sofnn_torch.pictures.film import film, gif
+from sofnn_torch.pictures.film import film, gif, mp4
+from sofnn_torch.progress import Progress
 from sofnn_torch.runs import checkpoint, seeding
 from sofnn_torch.runs.directory import same_settings
 from sofnn_torch.runs.factory import make_agent, make_env
@@ -142,6 +146,7 @@ def evaluate(
     explore: bool = False,
     seed: Annotated[int, Within(least=0)] = 1000,
     render_mode: str | None = None,
+    quiet: bool = True,
 ) -> list[TrialRecord]:
     """Play trials without learning.
 
@@ -152,14 +157,18 @@ def evaluate(
         explore: sample the stochastic policy.
         seed: seed of the motor noise and of the policy's chance.
         render_mode: ``human`` shows the trials in a window.
+        quiet: show no progress.
     """
     env = make_env(config, render_mode=render_mode)
     try:
         seeding.begin(env, agent, seed)
-        records = []
-        for trial in range(1, episodes + 1):
-            record, _ = play(env, agent, learn=False, explore=explore)
-            records.append(dataclasses.replace(record, trial=trial))
+        records, arrived = [], 0
+        with Progress("evaluation", episodes, quiet=quiet) as progress:
+            for trial in range(1, episodes + 1):
+                record, _ = play(env, agent, learn=False, explore=explore)
+                records.append(dataclasses.replace(record, trial=trial))
+                arrived += record.success
+                progress.update(facts=[f"goal in {arrived}", f"{record.steps} steps"])
         return records
     finally:
         env.close()
@@ -245,13 +254,16 @@ def plain(row: Estimate) -> dict[str, float | None]:
 
 
 def write_video(path: Path, config: Config, agent: Learner, seed: int, explore: bool) -> None:
-    """Film the first trial that `evaluate` plays with the same seed, 30 times as fast as it is."""
+    """Film the first trial that `evaluate` plays with the same seed, 30 times as fast as it is.
+
+    Raises:
+        OSError: the film cannot be made or written.
+    """
     if path.suffix == ".gif":
-        path.write_bytes(gif(film(config, agent, seed, explore, steps_per_frame=5, size=360)))
-        return
-    with imageio.get_writer(path, fps=30) as writer:
-        for frame in film(config, agent, seed, explore):
-            writer.append_data(frame)
+        data = gif(film(config, agent, seed, explore, steps_per_frame=5, size=360))
+    else:
+        data = mp4(film(config, agent, seed, explore))
+    checkpoint.write_atomically(path, data)
 
 
 @arithmetic()
@@ -271,6 +283,7 @@ def run(options: Options) -> dict[str, Estimate]:
         options.explore,
         options.seed,
         "human" if options.viewer else None,
+        quiet=False,
     )
     env = make_env(config)
     rows = summarise(records, optimal_steps(env.unwrapped.plan, config.maze.hold).steps)
@@ -291,7 +304,8 @@ def run(options: Options) -> dict[str, Estimate]:
             "config": dataclasses.asdict(config),
             "versions": versions(),
         }
-        options.json.write_text(json.dumps(results, indent=2) + "\n")
+        data = json.dumps(results, indent=2) + "\n"
+        checkpoint.write_atomically(options.json, data.encode())
         print(f"written: {options.json}")
     if options.video:
         write_video(options.video, config, agent, options.seed, options.explore)

@@ -1,19 +1,29 @@
 """Command lines from typed settings, with one clear line for what is wrong."""
 
 import contextlib
+import dataclasses
 import io
-import os
 import re
+import shlex
+import signal
 import sys
-from collections.abc import Callable, Iterator, Sequence
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import tyro
-from tqdm import tqdm
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
 from sofnn_torch import numerals
+from sofnn_torch.progress import say
+from sofnn_torch.runs.signals import Interrupted
+from sofnn_torch.streams import output
+
+__all__ = ["attempt", "command", "parse", "plural", "program", "quoted", "say"]
+
+# Exit codes by what went wrong, the first that fits.
+FAILURES = dict.fromkeys((ValueError, OSError, RuntimeError, ArithmeticError), 2)
 
 # What tyro says, and how it is said here; the first that fits.
 PLAIN = {
@@ -65,53 +75,116 @@ def parse(kind: Any, argv: Sequence[str], description: str, default: Any = None)
     settings = {} if default is None else {"default": default}
     try:
         with TYPES, contextlib.redirect_stderr(messages):
-            return tyro.cli(kind, args=argv, prog=_program(), description=description, **settings)
+            given = tyro.cli(kind, args=argv, prog=program(), description=description, **settings)
+        _refuse_flags_as_values(dataclasses.asdict(given), argv)
+        return given
     except SystemExit as stop:
         if not stop.code:
             raise
     raise ValueError(f"{_first_message(messages.getvalue())} (--help lists all flags)")
 
 
-def command(action: Callable[[Any], Any], kind: Any, description: str) -> None:
-    """Do an action with the settings that the command line gives; what is wrong is one line.
+def command(action: Callable[[Any], Any], kind: Any, description: str, advice: str = "") -> None:
+    """Do an action with the settings that the command line gives, and end the process.
 
     Args:
-        action: takes settings of the class.
+        action: takes settings of the class; may return an exit code.
         kind: the class, as for `parse`.
         description: shown above the flags in the help.
+        advice: how to go on after a stop.
 
     Raises:
-        SystemExit: with code 2 after an error that a user can do something about.
+        SystemExit: always, with the exit code of `attempt`.
     """
-    try:
-        with output():
-            action(parse(kind, sys.argv[1:], description))
-    except (ValueError, OSError, RuntimeError, ArithmeticError) as error:
-        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
-        sys.exit(2)
+
+    def work() -> int:
+        code = action(parse(kind, sys.argv[1:], description))
+        return code if isinstance(code, int) else 0
+
+    sys.exit(attempt(work, advice=advice))
+
+
+def attempt(
+    work: Callable[[], int], failures: Mapping[type[Exception], int] = FAILURES, advice: str = ""
+) -> int:
+    """Do the work of a command; its exit code. What is wrong is one line.
+
+    Args:
+        work: the work; returns an exit code.
+        failures: exit codes of the errors that a user can do something about.
+        advice: how to go on after a stop, where it does not come with the stop itself.
+
+    Returns:
+        The code of the work or of its failure; 128 and the number of the signal that stopped it.
+    """
+    with output() as refused:
+        try:
+            with _keyboard_interrupts():
+                code = work()
+        except tuple(failures) as error:
+            say(f"error: {' '.join(str(error).split())}")
+            code = next(c for kind, c in failures.items() if isinstance(error, kind))
+        except Interrupted as stop:
+            go_on = f"go on with: {program()} --resume {quoted(stop.run)}" if stop.run else advice
+            say(f"stopped and saved; {go_on}" if go_on else "stopped")
+            code = 128 + stop.number
+        except KeyboardInterrupt:
+            say("stopped")
+            code = 128 + signal.SIGINT
+    if refused and not code:
+        say(f"error: the output cannot be written ({refused[0].strerror})")
+        return 1
+    return code
 
 
 @contextlib.contextmanager
-def output() -> Iterator[None]:
-    """Inside, what the encoding lacks prints as ``?``, and a reader that leaves is no error."""
-    if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(errors="replace")
+def _keyboard_interrupts() -> Iterator[None]:
+    """Inside, Ctrl-C is a `KeyboardInterrupt`, also where it ended the process until now."""
+    here = threading.current_thread() is threading.main_thread()
+    former = signal.getsignal(signal.SIGINT)
+    if not here or former != signal.SIG_DFL:
+        yield
+        return
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
-        try:
-            yield
-        finally:
-            print(end="", flush=True)
-    except BrokenPipeError:  # whoever read has enough; Python must not try again on exit
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        yield
+    finally:
+        signal.signal(signal.SIGINT, former)
 
 
-def _program() -> str:
-    """What was called, as the help shows it: a module, a file or an installed command."""
-    module = sys.modules["__main__"].__spec__
+def program(name: str | None = None) -> str:
+    """What was called, as one can call it again: a module, a file or an installed command.
+
+    Args:
+        name: of another command of this package, such as ``evaluate``; None for the same.
+    """
+    python = shlex.quote(sys.orig_argv[0] if sys.orig_argv else "python")
+    module, path = sys.modules["__main__"].__spec__, sys.argv[0]
+    installed = Path(path).name
+    if name and module is None and installed.startswith("sofnn-"):
+        return f"sofnn-{name}"
+    if name:
+        return f"{python} -m sofnn_torch.{name}"
     if module:
-        return f"python -m {module.name.removesuffix('.__main__')}"
-    path = sys.argv[0]
-    return f"python {path}" if path.endswith(".py") else Path(path).name
+        return f"{python} -m {module.name.removesuffix('.__main__')}"
+    return f"{python} {quoted(path)}" if path.endswith(".py") else installed
+
+
+def quoted(path: Path | str) -> str:
+    """A path for a command line that can be pasted into a shell."""
+    text = str(path)
+    return shlex.quote(f"./{text}" if text.startswith("-") else text)
+
+
+def _refuse_flags_as_values(settings: dict[str, Any], argv: Sequence[str]) -> None:
+    """Raise ValueError on text or a path that looks like a flag: its value was forgotten."""
+    for name, value in settings.items():
+        if isinstance(value, dict):
+            _refuse_flags_as_values(value, argv)
+        elif isinstance(value, str | Path) and str(value).startswith("-"):
+            flag = f"--{name}".replace("_", "-")
+            if str(value) in argv or f"{flag}={value}" in argv:  # ./-x is a path as any other
+                raise ValueError(f"{flag} needs a value, and {value} looks like a flag")
 
 
 def _first_message(framed: str) -> str:
@@ -132,11 +205,6 @@ def _first_message(framed: str) -> str:
             return found.expand(plain)
     hint = next((m[1] for line in lines[end:] if (m := re.match(r"(--\w[\w.-]*)", line))), None)
     return f"{what}; did you mean {hint}?" if hint and "nrecognized" in what else what
-
-
-def say(text: str) -> None:
-    """One line on the error stream, above a progress bar if there is one."""
-    tqdm.write(text, file=sys.stderr)
 
 
 def plural(number: int, thing: str) -> str:

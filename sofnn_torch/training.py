@@ -10,18 +10,18 @@ import time
 from pathlib import Path
 from typing import Any
 
-from tqdm import tqdm
-
 from sofnn_torch.learners.frozen import FrozenPolicy
 from sofnn_torch.learners.learner import Learner
 from sofnn_torch.maze.env import KheperaMazeEnv
 from sofnn_torch.pictures.tensorboard import Monitor
+from sofnn_torch.progress import Progress
 from sofnn_torch.runs import checkpoint, session
 from sofnn_torch.runs.guard import Divergence, Watch
 from sofnn_torch.runs.session import RunOptions, Session, arithmetic
 from sofnn_torch.runs.settings import Config, from_dict
 from sofnn_torch.runs.signals import Interrupted, SignalTrap
 from sofnn_torch.runs.trial import Recorder, Trajectory, TrialRecord
+from sofnn_torch.streams import output
 from sofnn_torch.terminal import plural, say
 
 __all__ = ["RunOptions", "play", "replay", "resume", "train"]
@@ -71,12 +71,12 @@ def train(config: Config, options: RunOptions | None = None) -> Path:
 
     Raises:
         ValueError: settings or run directory cannot be used; nothing was written then.
-        Interrupted: after saving, on SIGINT or SIGTERM.
+        Interrupted: after saving, on a signal that asks to stop.
         Divergence: after saving, when numbers diverge.
         OSError: the disk refused the last checkpoint; the message says where it is instead.
     """
     options = options or RunOptions()
-    with SignalTrap() as trap, arithmetic(options.threads, options.portable):
+    with SignalTrap() as trap, output(), arithmetic(options.threads, options.portable):
         return _loop(session.begin(config, options), options, trap)
 
 
@@ -94,7 +94,7 @@ def resume(path: Path | str, options: RunOptions | None = None, trials: int | No
         ValueError, Interrupted, Divergence, OSError: as `train`.
     """
     options = options or RunOptions()
-    with SignalTrap() as trap, arithmetic(options.threads, options.portable):
+    with SignalTrap() as trap, output(), arithmetic(options.threads, options.portable):
         reopened = session.reopen(Path(path), options, trials)
         if reopened.trial == reopened.run.config.trials:
             reopened.close()
@@ -126,19 +126,13 @@ def _loop(session: Session, options: RunOptions, trap: SignalTrap) -> Path:
     monitor = Monitor(
         run.path, run.config, session.trial + 1, options.picture_every, options.video_every
     )
-    progress = tqdm(
-        total=run.config.trials,
-        initial=session.trial,
-        disable=options.quiet,
-        desc=run.path.name,
-        dynamic_ncols=True,
-        bar_format="{desc} {percentage:3.0f}%|{bar}| {n}/{total} [{elapsed}<{remaining}{postfix}]",
-    )
+    progress = Progress(run.path.name, run.config.trials, session.trial, options.quiet)
     try:
         while session.trial < run.config.trials:
             begin = time.perf_counter()
             record, path = play(session.env, agent, trap=trap)
-            speed = record.steps / (time.perf_counter() - begin)
+            seconds = time.perf_counter() - begin
+            speed = record.steps / seconds
             record = dataclasses.replace(
                 record,
                 trial=session.trial + 1,
@@ -156,8 +150,7 @@ def _loop(session: Session, options: RunOptions, trap: SignalTrap) -> Path:
             if agent.net.refused:
                 rules = plural(agent.net.max_rules, "rule")
                 run.warn("cap", f"{rules} reached (--net.max-rules): no more are added")
-            progress.set_postfix_str(_summary(record, session.state, speed), refresh=False)
-            progress.update()
+            progress.update(seconds=seconds, facts=_summary(record, session.state, speed))
     except Interrupted as stop:
         stop.run = run.path
         raise
@@ -184,8 +177,9 @@ def _row(record: TrialRecord) -> dict[str, Any]:
     return row | row.pop("statistics")
 
 
-def _summary(record: TrialRecord, state: dict[str, Any], speed: float) -> str:
+def _summary(record: TrialRecord, state: dict[str, Any], speed: float) -> list[str]:
+    """What the progress shows, the most important first."""
     outcome = f"{record.steps} steps" if record.success else "no goal"
     recent = [success for success, _ in state["recent"]]
     share = f"goal in {sum(recent)} of {len(recent)}"
-    return f"{outcome}, {plural(record.rules, 'rule')}, {share}, {speed:,.0f} steps/s"
+    return [f"{speed:,.0f} steps/s", share, outcome, plural(record.rules, "rule")]

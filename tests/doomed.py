@@ -14,7 +14,7 @@ from sofnn_torch.runs.settings import Config
 from sofnn_torch.runs.signals import Interrupted
 from sofnn_torch.training import RunOptions
 
-FILE_EVENTS = {"open", "os.rename", "os.remove"}
+FILE_EVENTS = {"open", "os.mkdir", "os.rename", "os.remove", "os.rmdir"}
 MOMENTS = ("decision", "file", "fsync", "half written")
 
 
@@ -63,7 +63,8 @@ def _live(config, options, run, moment, number) -> None:
         return moment == (kind, counts[kind])
 
     def audit(event: str, arguments: tuple) -> None:
-        if event in FILE_EVENTS and run.name in str(arguments[0]) and pass_by("file"):
+        here = event in FILE_EVENTS and str(arguments[0]).startswith(str(run.parent))
+        if here and pass_by("file"):
             os.kill(os.getpid(), number)
 
     def fsync(descriptor: int) -> None:

@@ -2,9 +2,14 @@
 
 import copy
 import io
+import multiprocessing
 import os
 import random
+import resource
 import shutil
+import stat
+import sys
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -387,13 +392,11 @@ def test_a_file_is_on_the_disk_before_it_takes_its_name(state, tmp_path, monkeyp
 
 def rewound(directory, state, data):
     """The lines of a trial table that are left after going back to a state."""
-    run = Run.create(directory, "run", settings(), keep=3)
-    try:
+    with Run.create([directory / "run"], settings(), keep=3) as run:
         (run.path / "trials.csv").write_bytes(data)
         run.rewind(state)
-        return run.rows
-    finally:
-        run.close()
+    run.close()
+    return run.rows
 
 
 @pytest.mark.parametrize(
@@ -429,3 +432,140 @@ def test_of_any_trial_table_only_whole_lines_of_known_trials_are_left(state, dat
     whole = iter(data.decode(errors="replace").splitlines(keepends=True))
     assert all(row in whole and row.endswith("\n") for row in rows)  # in their order
     assert all(int(row.partition(",")[0]) in (1, 2, 3, 4) for row in rows[1:])
+
+
+# ------------------------------------------------------------------- links, modes and small bombs
+
+
+def test_a_symbolic_link_stays_one(tmp_path):
+    (tmp_path / "disk").mkdir()
+    link = tmp_path / "link"
+    link.symlink_to("disk/file")  # which is not there yet
+    for data in (b"old", b"new"):
+        checkpoint.write_atomically(link, data)
+        assert link.is_symlink() and (tmp_path / "disk" / "file").read_bytes() == data
+    assert sorted(path.name for path in tmp_path.rglob("*")) == ["disk", "file", "link"]
+
+
+@pytest.mark.parametrize("mode", [0o600, 0o640, 0o444])
+def test_a_file_that_is_rewritten_keeps_its_mode(mode, tmp_path):
+    path = tmp_path / "file"
+    path.write_bytes(b"old")
+    path.chmod(mode)
+    checkpoint.write_atomically(path, b"new")
+    assert path.read_bytes() == b"new" and stat.S_IMODE(path.stat().st_mode) == mode
+
+
+def test_a_new_file_has_the_usual_mode(tmp_path):
+    (tmp_path / "usual").write_bytes(b"")
+    checkpoint.write_atomically(tmp_path / "new", b"")
+    modes = [stat.S_IMODE((tmp_path / name).stat().st_mode) for name in ("usual", "new")]
+    assert modes[0] == modes[1]
+
+
+def test_a_device_is_written_to(tmp_path):
+    (tmp_path / "nothing").symlink_to(os.devnull)
+    checkpoint.write_atomically(tmp_path / "nothing", b"data")
+    assert (tmp_path / "nothing").is_char_device()
+
+
+def test_a_name_of_the_greatest_length_can_be_written(tmp_path):
+    checkpoint.write_atomically(tmp_path / ("x" * 255), b"data")
+    assert [len(path.name) for path in tmp_path.iterdir()] == [255]
+
+
+def enclosed(payload):
+    """A file with a right checksum around a payload."""
+    digest = checkpoint._digest(checkpoint.VERSION, payload)
+    return b"sofnn-torch checkpoint %d %s\n" % (checkpoint.VERSION, digest) + payload
+
+
+def saved(content):
+    buffer = io.BytesIO()
+    torch.save(content, buffer)
+    return buffer.getvalue()
+
+
+def zipped(payload, **style):
+    """The same archive, packed otherwise."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(io.BytesIO(payload)) as old, zipfile.ZipFile(buffer, "w", **style) as new:
+        for name in old.namelist():
+            new.writestr(name, old.read(name))
+    return buffer.getvalue()
+
+
+def nested():
+    """A list of a thousand lists, each of a thousand ..., that is written once at each level."""
+    part = [0] * 1000
+    for _ in range(8):
+        part = [part] * 1000
+    return part
+
+
+class Reserved:
+    """Bytes that reading makes, not writing."""
+
+    def __reduce__(self):
+        return bytearray, (2**29,)
+
+
+def sparse(size):
+    return torch.sparse_coo_tensor([[0]], [1.0], (size,), check_invariants=True)
+
+
+MIB = 2**20
+BOMBS = {
+    "stride 0": lambda state: saved(state | {"agent": {"x": torch.zeros(1).expand(500 * MIB)}}),
+    "overlapping": lambda state: saved(
+        state | {"agent": {"x": torch.zeros(20_000).as_strided((10_000, 10_000), (1, 1))}}
+    ),
+    "packed": lambda state: zipped(
+        saved(state | {"agent": {"x": torch.zeros(20 * MIB)}}), compression=zipfile.ZIP_DEFLATED
+    ),
+    "nested": lambda state: saved(state | {"agent": {"x": nested()}}),
+    "bytes": lambda state: saved(state | {"agent": {"x": Reserved()}}),
+    "sparse": lambda state: saved(state | {"agent": {"x": sparse(500 * MIB)}}),
+    "elsewhere": lambda state: saved(
+        state | {"agent": {"x": torch.empty(500 * MIB, device="meta")}}
+    ),
+    "one part for many": lambda state: saved(
+        state
+        | {"recent": [torch.zeros(10_000)] + [None], "agent": {}}
+        | {"best": [part for part in [torch.zeros(10_000)] for _ in range(20_000)]}
+    ),
+}
+
+
+def peak_of_loading(path, answer):
+    """In a process of its own: what is said about a file, and the memory that it took."""
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    try:
+        state = checkpoint.load(path)
+        config = settings()
+        checkpoint.restore(path, state, make_agent(config), make_env(config))
+        said = "loaded"
+    except CheckpointError as error:
+        said = str(error)
+    unit = 1 if sys.platform == "darwin" else 1024
+    answer.put((said, unit * (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)))
+
+
+@pytest.mark.parametrize("kind", [*BOMBS, "enormous"])
+def test_a_small_hostile_file_takes_no_memory(kind, state, tmp_path):
+    path = tmp_path / "bomb.pt"
+    if kind == "enormous":  # on the disk it is small
+        path.write_bytes(enclosed(b""))
+        os.truncate(path, 2**40)
+    else:
+        path.write_bytes(enclosed(BOMBS[kind](state)))
+        assert path.stat().st_size < 2 * MIB
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["sofnn_torch.training"])
+    answer = context.SimpleQueue()
+    child = context.Process(target=peak_of_loading, args=(path, answer))
+    child.start()
+    said, peak = answer.get()
+    child.join()
+    assert said.startswith(f"{path}: ") and "\n" not in said
+    assert peak < 60 * MIB

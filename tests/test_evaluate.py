@@ -1,8 +1,10 @@
 """Evaluation: intervals, table, files, and one clear line for what is wrong."""
 
 import dataclasses
+import errno
 import json
 import math
+import os
 import runpy
 from dataclasses import replace
 from pathlib import Path
@@ -10,9 +12,12 @@ from pathlib import Path
 import imageio.v3 as imageio
 import numpy as np
 import pytest
+from conftest import settings
 
 from sofnn_torch import evaluate, terminal
 from sofnn_torch.maze.rendering import RenderingError
+from sofnn_torch.pictures import film
+from sofnn_torch.pictures.film import mp4
 from sofnn_torch.runs.settings import Config
 from sofnn_torch.runs.trial import TrialRecord
 from sofnn_torch.training import RunOptions, train
@@ -253,3 +258,49 @@ def test_a_checkpoint_of_other_settings_is_refused(trained, tmp_path, monkeypatc
 )
 def test_framed_messages_become_one_line_with_any_encoding(framed):
     assert terminal._first_message(framed) == "Unrecognized options: --n; did you mean --name?"
+
+
+def frames(count=30):
+    dice = np.random.default_rng(0)
+    return (dice.integers(0, 255, (64, 64, 3), np.uint8) for _ in range(count))
+
+
+def test_a_film_has_all_its_frames(tmp_path):
+    (tmp_path / "film.mp4").write_bytes(mp4(frames()))
+    assert len(list(imageio.imiter(tmp_path / "film.mp4"))) == 30
+
+
+@pytest.mark.parametrize(
+    "script,message",
+    [
+        ("echo Unknown encoder libx264 >&2; exit 1", "ffmpeg failed (Unknown encoder libx264)"),
+        ("head -c 9 >/dev/null; printf 'No space left\\nmore' >&2; exit 1", "(No space left)"),
+        ("kill -9 $$", "ffmpeg failed (-9)"),
+    ],
+)
+def test_a_film_that_cannot_be_made_says_so_in_one_line(script, message, tmp_path, monkeypatch):
+    fake = tmp_path / "ffmpeg"
+    fake.write_text(f"#!/bin/sh\n{script}\n")
+    fake.chmod(0o755)
+    monkeypatch.setattr(film.imageio_ffmpeg, "get_ffmpeg_exe", lambda: str(fake))
+    with pytest.raises(OSError) as refusal:
+        mp4(frames())
+    assert message in str(refusal.value) and "\n" not in str(refusal.value)
+
+
+def test_a_film_without_an_encoder_says_so(monkeypatch):
+    monkeypatch.setattr(film.imageio_ffmpeg, "get_ffmpeg_exe", lambda: "/no/ffmpeg")
+    with pytest.raises(OSError, match="ffmpeg cannot be started"):
+        mp4(frames())
+
+
+@pytest.mark.parametrize("ending", ["mp4", "gif"])
+def test_a_film_for_a_full_disk_says_so_in_one_line(ending, tmp_path, monkeypatch):
+    def refuse(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(evaluate, "film", lambda *_, **__: frames(3))
+    monkeypatch.setattr(os, "fsync", refuse)
+    with pytest.raises(OSError, match=r"No space left on device: '\S+/film\.\w+'"):
+        evaluate.write_video(tmp_path / f"film.{ending}", settings(), None, 0, False)
+    assert not list(tmp_path.iterdir())

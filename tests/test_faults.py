@@ -9,7 +9,9 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import doomed
@@ -21,10 +23,11 @@ from sofnn_torch import training
 from sofnn_torch.pictures import tensorboard
 from sofnn_torch.runs import checkpoint
 from sofnn_torch.runs.checkpoint import CheckpointError
-from sofnn_torch.runs.directory import Run, default_name, load_config
+from sofnn_torch.runs.directory import Run, load_config
 from sofnn_torch.runs.factory import make_agent, make_env
 from sofnn_torch.runs.guard import Divergence
-from sofnn_torch.runs.signals import Interrupted
+from sofnn_torch.runs.places import default_name, numbered
+from sofnn_torch.runs.signals import NUMBERS, Interrupted, SignalTrap
 from sofnn_torch.training import play
 
 NAME = default_name(settings())
@@ -281,18 +284,82 @@ def test_a_failed_resume_gives_the_run_back(options):
         pass
 
 
+# --------------------------------------------------------------------------------------- starting
+
+
+def test_any_number_of_simultaneous_starts_make_as_many_runs(tmp_path):
+    together = threading.Barrier(8)
+
+    def start():
+        together.wait()
+        with Run.create(numbered(tmp_path / "runs" / "run"), settings(), keep=3) as run:
+            run.begin({"trial": 0})
+        run.close()
+        return run.path
+
+    with ThreadPoolExecutor(8) as pool:
+        made = [future.result() for future in [pool.submit(start) for _ in range(8)]]
+    assert len(set(made)) == 8 and sorted((tmp_path / "runs").iterdir()) == sorted(made)
+    assert all((run / "checkpoint-0.pt").exists() and load_config(run) for run in made)
+
+
+def test_the_same_name_given_twice_is_refused_and_leaves_nothing(options):
+    named = dataclasses.replace(options, name="run")
+    training.train(settings(trials=1), named)
+    before = (options.runs / "run" / "trials.csv").read_bytes()
+    with pytest.raises(ValueError, match=r"exists: choose another --name, or go on with --resume"):
+        training.train(settings(trials=1), named)
+    assert [path.name for path in options.runs.iterdir()] == ["run"]
+    assert (options.runs / "run" / "trials.csv").read_bytes() == before
+
+
+def test_an_empty_directory_is_no_obstacle(options):
+    (options.runs / NAME).mkdir(parents=True)
+    assert training.train(settings(trials=1), options) == options.runs / NAME
+
+
+def test_a_start_that_fails_half_way_leaves_nothing(tmp_path):
+    with pytest.raises(KeyError), Run.create([tmp_path / "run"], settings(), keep=3) as run:
+        run.begin({})
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    "kind,count", [("file", n) for n in range(1, 15)] + [("fsync", n) for n in range(1, 6)]
+)
+def test_a_crash_at_any_instant_of_starting_leaves_a_whole_run_or_none(kind, count, tmp_path):
+    config, options, run = settings(trials=1), quick_options(tmp_path / "runs"), tmp_path / "runs"
+    run = run / NAME
+    assert doomed.finish(doomed.start(config, options, run, (kind, count))) == -signal.SIGKILL
+    if run.exists():
+        assert load_config(run) == config and checkpoint.find_latest(run)
+    assert doomed.finish(doomed.start(config, options, run)) == 0
+    assert checkpoint.find_latest(run)[1]["trial"] == 1
+    assert list(options.runs.iterdir()) == [run]  # nothing is left behind
+
+
 # ---------------------------------------------------------------------------------------- signals
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", NUMBERS)
 def test_a_signal_between_trials_saves_what_is_done(number, options, between_trials):
     between_trials(before_4=lambda: os.kill(os.getpid(), number))
-    handlers = [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)]
+    handlers = [signal.getsignal(n) for n in NUMBERS]
     with pytest.raises(Interrupted) as caught:
         training.train(settings(), quick_options(options.runs, checkpoint_every=100))
     assert caught.value.number == number and caught.value.run == options.runs / NAME
     assert checkpoint.find_latest(options.runs / NAME)[1]["trial"] == 3
-    assert [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)] == handlers
+    assert [signal.getsignal(n) for n in NUMBERS] == handlers
+
+
+def test_a_hangup_that_is_ignored_stays_ignored():
+    former = signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as nohup does
+    try:
+        with SignalTrap() as trap:
+            os.kill(os.getpid(), signal.SIGHUP)
+            assert not trap.number
+    finally:
+        signal.signal(signal.SIGHUP, former)
 
 
 @pytest.mark.parametrize("kind", [ValueError, RuntimeError, MemoryError])

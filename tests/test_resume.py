@@ -13,7 +13,8 @@ import pytest
 from conftest import assert_same_run, quick_options, settings
 from tensorboard import program
 
-from sofnn_torch.runs.directory import default_name
+from sofnn_torch.runs.places import default_name
+from sofnn_torch.runs.signals import NUMBERS
 
 # Both learners on a growing network, with every kind of pose.
 GROWING = {
@@ -104,7 +105,7 @@ def assert_a_signal_does_no_harm(case, number, kind, point, references, tmp_path
     assert_same_end(run, reference)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", NUMBERS)
 @pytest.mark.parametrize("kind", ["decision", "file", "fsync"])
 def test_a_signal_saves_the_run_and_resume_goes_on_bit_for_bit(number, kind, references, tmp_path):
     assert_a_signal_does_no_harm("sga estimated", number, kind, 0, references, tmp_path)

@@ -12,11 +12,13 @@ import pytest
 from PIL import Image
 from tensorboard.backend.event_processing import plugin_event_accumulator
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.compat.proto.summary_pb2 import Summary
 from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
 
 from sofnn_torch.maze.env import KheperaMazeEnv
 from sofnn_torch.maze.rendering import RenderingError
 from sofnn_torch.maze.robot import default_model_path
+from sofnn_torch.pictures import events as events_module
 from sofnn_torch.pictures import film as film_module
 from sofnn_torch.pictures.events import EventFile
 from sofnn_torch.pictures.film import film, gif
@@ -282,3 +284,16 @@ def test_the_states_of_the_decisions_are_those_that_the_robot_knew():
     np.testing.assert_array_equal(path.decided_at("true"), true[:2])
     for pose in ("estimated", "odometry"):
         np.testing.assert_array_equal(path.decided_at(pose), estimated[:2])
+
+
+def test_files_are_read_in_the_order_of_the_sessions_if_the_clock_goes_back(tmp_path, monkeypatch):
+    for now, first, value in ((2e9, 1, 1.0), (1e9, 2, 2.0), (5.0, 3, 3.0)):
+        monkeypatch.setattr(events_module.time, "time", lambda now=now: now)
+        file = EventFile(tmp_path, first)
+        for step in range(first, 5):
+            file.add(Summary(value=[Summary.Value(tag="x", simple_value=value)]), step)
+        file.close()
+    accumulator = EventAccumulator(str(tmp_path))
+    accumulator.Reload()
+    curve = [(e.step, e.value) for e in accumulator.Scalars("x")]
+    assert curve == [(1, 1.0), (2, 2.0), (3, 3.0), (4, 3.0)]

@@ -5,7 +5,11 @@ policies are measured against it.
 """
 
 import math
+import signal
 from dataclasses import dataclass
+
+if __name__ == "__main__":  # Ctrl-C while libraries load
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 import numpy as np
 from numpy.typing import NDArray

@@ -6,6 +6,7 @@ the death of a thread.
 """
 
 import os
+import re
 import socket
 import time
 from pathlib import Path
@@ -13,6 +14,8 @@ from pathlib import Path
 from tensorboard.compat.proto.event_pb2 import Event, SessionLog
 from tensorboard.compat.proto.summary_pb2 import Summary
 from tensorboard.summary.writer.record_writer import RecordWriter
+
+PREFIX = "events.out.tfevents."
 
 
 class EventFile:
@@ -28,8 +31,10 @@ class EventFile:
     """
 
     def __init__(self, directory: Path, first_step: int):
-        # Files are read in the order of their names; seconds alone would not order them.
-        name = f"events.out.tfevents.{time.time():.6f}.{socket.gethostname()}.{os.getpid()}"
+        # Files are read in the order of their names, also if the clock has been put back; seconds
+        # alone would not order them.
+        stamp = max(time.time(), _last_stamp(Path(directory)) + 1e-6)
+        name = f"{PREFIX}{stamp:017.6f}.{socket.gethostname()}.{os.getpid()}"
         self.path = Path(directory) / name
         self._records = RecordWriter(open(self.path, "xb"))  # noqa: SIM115
         self._add(Event(file_version="brain.Event:2"), 0)
@@ -59,3 +64,10 @@ class EventFile:
     def _add(self, event: Event, step: int) -> None:
         event.step, event.wall_time = step, time.time()
         self._records.write(event.SerializeToString())
+
+
+def _last_stamp(directory: Path) -> float:
+    """The latest time in the names of the event files of a directory; 0 if there are none."""
+    names = [path.name.removeprefix(PREFIX) for path in directory.glob(f"{PREFIX}*")]
+    found = [re.match(r"\d{1,11}(\.\d{6})?", name) for name in names]
+    return max((float(stamp[0]) for stamp in found if stamp), default=0.0)

@@ -1,8 +1,14 @@
 """Films of a learned policy."""
 
+import contextlib
 import io
+import itertools
+import subprocess
+import tempfile
 from collections.abc import Iterator
+from pathlib import Path
 
+import imageio_ffmpeg
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
@@ -88,3 +94,34 @@ def gif(frames: Iterator[NDArray[np.uint8]], frames_per_second: int = 12) -> byt
         loop=0,
     )
     return buffer.getvalue()
+
+
+def mp4(frames: Iterator[NDArray[np.uint8]], frames_per_second: int = 30) -> bytes:
+    """A film in H.264.
+
+    Raises:
+        OSError: there is no encoder, or it failed; the message says why.
+    """
+    first = next(frames)
+    height, width, _ = first.shape
+    raw = f"-f rawvideo -pix_fmt rgb24 -s {width}x{height} -r {frames_per_second} -i -"
+    coded = "-an -c:v libx264 -crf 25 -pix_fmt yuv420p"
+    with tempfile.TemporaryDirectory() as place, tempfile.TemporaryFile() as messages:
+        file = Path(place) / "film.mp4"
+        try:
+            command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error"]
+            command += [*raw.split(), *coded.split(), str(file)]
+            encoder = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=messages)
+        except (OSError, RuntimeError) as error:
+            raise OSError(f"no film: ffmpeg cannot be started ({error})") from None
+        try:
+            with contextlib.suppress(BrokenPipeError), encoder.stdin as pipe:
+                for frame in itertools.chain([first], frames):
+                    pipe.write(frame.tobytes())
+        finally:
+            encoder.wait()
+        if encoder.returncode:
+            messages.seek(0)
+            said = messages.read().decode(errors="replace").strip().splitlines()
+            raise OSError(f"no film: ffmpeg failed ({said[0] if said else encoder.returncode})")
+        return file.read_bytes()

@@ -11,10 +11,14 @@ The run directory is not changed. docs/rules.md says how to read a rule and what
 import json
 import math
 import shutil
+import signal
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
+
+if __name__ == "__main__":  # Ctrl-C while libraries load
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 import numpy as np
 import torch
@@ -31,8 +35,9 @@ from sofnn_torch.pictures import figures
 from sofnn_torch.rules import files, words
 from sofnn_torch.rules.words import Decision, Reading, number
 from sofnn_torch.runs import checkpoint, seeding
-from sofnn_torch.runs.directory import Run, first_free
+from sofnn_torch.runs.directory import Run
 from sofnn_torch.runs.factory import make_env
+from sofnn_torch.runs.places import numbered
 from sofnn_torch.runs.session import RunOptions, arithmetic, home_of
 from sofnn_torch.runs.settings import Config
 from sofnn_torch.terminal import command, plural, say
@@ -206,21 +211,17 @@ def edit(
     if home is None:
         raise ValueError(f"{options.run}: --load needs a run directory or a checkpoint in one")
     home = home if home.name not in ("", "..") else home.resolve()
-    name = options.name or first_free(home.with_name(f"{home.name}-edited")).name
+    usual = numbered(home.with_name(f"{home.name}-edited"))
+    places = [home.with_name(options.name)] if options.name else usual
     before = json.loads((home / "config.json").read_bytes())
     session = {"versions": before.get("versions"), "commit": before.get("commit")}
     session["edited"] = {"checkpoint": str(path), "rules": str(options.load)}
     earlier = [*before.get("earlier", []), session]
-    run = Run.create(home.parent, name, config, RunOptions.keep, earlier)
-    try:
+    with Run.create(places, config, RunOptions.keep, earlier) as run:
         if (trials := home / "trials.csv").exists():
             shutil.copyfile(trials, run.path / "trials.csv")
         run.rewind(state)
-    except BaseException:
-        shutil.rmtree(run.path, ignore_errors=True)
-        raise
-    finally:
-        run.close()
+    run.close()
     return run.path
 
 

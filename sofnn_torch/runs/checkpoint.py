@@ -14,7 +14,11 @@ import copy
 import hashlib
 import io
 import os
+import pickletools
 import re
+import secrets
+import stat
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -24,6 +28,9 @@ import torch
 VERSION = 2
 HEADER = re.compile(rb"sofnn-torch checkpoint (\d{1,9}) ([0-9a-f]{64})\n")
 HEADER_SIZE = 200  # no header line is longer
+LARGEST = 2**30  # bytes of a file; a million rules take less
+# What a payload is made of; torch would read more, some of which takes memory as it likes.
+BUILT_OF = re.compile(r"torch \w+Storage|torch\._utils _rebuild_tensor_v2|collections OrderedDict")
 NAME = re.compile(r"checkpoint-(\d+)\.pt")
 ADVICE = "; use an earlier checkpoint"
 KINDS = {
@@ -62,13 +69,18 @@ def load(path: Path) -> dict[str, Any]:
         CheckpointError: no such file, not a checkpoint, damaged, or of a newer version.
     """
     try:
-        data = Path(path).read_bytes()
+        with open(path, "rb") as file:
+            header = HEADER.fullmatch(file.readline(HEADER_SIZE))
+            if header is None:
+                raise CheckpointError(f"{path}: not a checkpoint of sofnn-torch")
+        payload = memoryview(read_file(path, LARGEST))[header.end() :]
     except OSError as error:
         raise CheckpointError(f"{path}: cannot be read ({error.strerror})") from None
-    header = HEADER.match(data[:HEADER_SIZE])
-    if header is None:
-        raise CheckpointError(f"{path}: not a checkpoint of sofnn-torch")
-    version, payload = int(header[1]), data[header.end() :]
+    except CheckpointError:
+        raise
+    except ValueError as error:
+        raise CheckpointError(f"{path}: {error}") from None
+    version = int(header[1])
     if header[2] != _digest(version, payload):
         raise CheckpointError(f"{path}: damaged or cut off (its checksum differs){ADVICE}")
     if version > VERSION:
@@ -81,7 +93,9 @@ def load(path: Path) -> dict[str, Any]:
             "anew, or use the version of sofnn-torch that wrote it (0.1.0)"
         )
     try:
+        _check_parts(payload)
         state = torch.load(io.BytesIO(payload), weights_only=True)
+        _check_extent(state, len(payload))
     except Exception as error:  # torch raises many kinds for a payload it does not know
         reason = str(error).partition("\n")[0]
         raise CheckpointError(f"{path}: not a checkpoint of sofnn-torch ({reason})") from None
@@ -192,21 +206,32 @@ def find_latest(
 def write_atomically(path: Path, data: bytes) -> None:
     """Replace a file by data so that a crash or a full disk leaves the old or the new file.
 
+    A symbolic link stays one, a file that was there keeps its mode, and what is no file but a
+    device or a pipe is written to.
+
     Raises:
         OSError: the file system refused; no part of the new file stays behind.
     """
-    temporary = path.with_name(f".{path.name}.tmp")
+    target = Path(os.path.realpath(path))
+    if target.exists() and not target.is_file() and not target.is_dir():
+        target.write_bytes(data)
+        return
+    temporary = target.with_name(f".{secrets.token_hex(8)}.tmp")
     try:
-        with open(temporary, "wb") as file:
+        with open(temporary, "xb") as file:
+            with contextlib.suppress(FileNotFoundError):
+                os.fchmod(file.fileno(), stat.S_IMODE(target.stat().st_mode))
             file.write(data)
             file.flush()
             os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except BaseException:
+        os.replace(temporary, target)
+    except BaseException as error:
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
+        if isinstance(error, OSError):  # of the name that the caller knows
+            raise OSError(error.errno, error.strerror, str(path)) from None
         raise
-    sync_directory(path.parent)
+    sync_directory(target.parent)
 
 
 def sync_directory(directory: Path) -> None:
@@ -220,7 +245,57 @@ def sync_directory(directory: Path) -> None:
         os.close(descriptor)
 
 
-def _digest(version: int, payload: bytes) -> bytes:
+def read_file(path: Path, most: int) -> bytes:
+    """The content of a file that should be small.
+
+    Raises:
+        ValueError: it has more than `most` bytes.
+        OSError: it cannot be read.
+    """
+    with open(path, "rb") as file:
+        size = os.fstat(file.fileno()).st_size
+        if size > most:
+            raise ValueError(f"{size:,} bytes are too many")
+        return file.read(most)
+
+
+def _check_parts(payload: memoryview) -> None:
+    """Raise ValueError if the parts of a payload would take more memory than it has bytes."""
+    with zipfile.ZipFile(io.BytesIO(payload)) as archive:
+        parts = archive.infolist()
+        packed = any(part.compress_type != zipfile.ZIP_STORED for part in parts)
+        if packed or sum(part.file_size for part in parts) > len(payload):
+            raise ValueError("its parts are larger than the file")
+        (pickle,) = (part for part in parts if part.filename.endswith("/data.pkl"))
+        for operation, what, _ in pickletools.genops(archive.read(pickle)):
+            if operation.name == "GLOBAL" and not BUILT_OF.fullmatch(str(what)):
+                raise ValueError(f"it has a {what}")
+
+
+def _check_extent(state: Any, most: int) -> None:
+    """Raise ValueError on tensors that repeat few numbers, and on parts inside each other.
+
+    Both take next to nothing until they are copied or compared.
+    """
+    rest = [state]
+    while rest and most >= 0:
+        part = rest.pop()
+        most -= 1
+        if isinstance(part, torch.Tensor):
+            most -= part.numel() * part.element_size()
+            if part.device.type != "cpu" or part.layout != torch.strided:
+                raise ValueError("a tensor that is not dense")
+        elif isinstance(part, dict | list | tuple | str | bytes):
+            most -= len(part)
+            if most >= 0 and isinstance(part, dict):
+                rest += [*part.keys(), *part.values()]
+            elif most >= 0 and isinstance(part, list | tuple):
+                rest += part
+    if most < 0:
+        raise ValueError("its content is larger than the file")
+
+
+def _digest(version: int, payload: bytes | memoryview) -> bytes:
     digest = hashlib.sha256(b"%d\n" % version)
     digest.update(payload)
     return digest.hexdigest().encode()

@@ -6,26 +6,29 @@ tries again to write all that is missing (docs/checkpoints.md).
 """
 
 import contextlib
-import csv
 import dataclasses
 import errno
-import io
 import itertools
 import json
 import os
+import secrets
 import shutil
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import filelock
 
-from sofnn_torch.runs import checkpoint
+from sofnn_torch.progress import say
+from sofnn_torch.runs import checkpoint, table
 from sofnn_torch.runs.checkpoint import CheckpointError
+from sofnn_torch.runs.places import UNNAMED, alone, first_free
 from sofnn_torch.runs.provenance import commit, versions
 from sofnn_torch.runs.settings import Config, from_dict
-from sofnn_torch.terminal import say
+from sofnn_torch.terminal import quoted
+
+LARGEST_SETTINGS = 2**20  # bytes
 
 
 class Run:
@@ -48,38 +51,41 @@ class Run:
         self._anchor: int | None = None
 
     @classmethod
+    @contextlib.contextmanager
     def create(
-        cls, parent: Path, name: str | None, config: Config, keep: int, earlier: Sequence[Any] = ()
-    ) -> "Run":
-        """Make a new directory and write the settings into it.
+        cls, places: Iterable[Path], config: Config, keep: int, earlier: Sequence[Any] = ()
+    ) -> "Iterator[Run]":
+        """Make a new directory, which is filled inside the block and appears whole at its end.
 
         Args:
-            parent: directory of all runs.
-            name: of the new directory; made from the settings if None.
+            places: where it may be; the first that is free, or an empty directory, is taken.
             config: the settings.
             keep: checkpoints that are kept.
             earlier: versions and commits of the sessions that it comes from.
 
+        Yields:
+            The run, under a hidden name; of a block that fails nothing is left.
+
         Raises:
-            ValueError: the name is taken or the directory cannot be written.
+            ValueError: all places are taken or the directory cannot be written.
         """
-        path = parent / (name or default_name(config))
-        path = path if name else first_free(path)
-        if path.exists():
-            raise ValueError(f"{path} exists: choose another --name, or go on with --resume {path}")
-        # Filled under another name first, so that a run directory always has its settings.
-        run = cls(parent / f".{path.name}-{os.getpid()}.tmp", config, keep)
-        run.earlier = list(earlier)
+        places = iter(places)
+        path = next(places)
         try:
-            run.path.mkdir(parents=True)
-            run._write_settings()
-            run.path = run.path.rename(path)
-            run._acquire()
+            with alone(path.parent):
+                hidden = path.with_name(f".{secrets.token_hex(8)}{UNNAMED}")
+                run = cls(hidden, config, keep)
+                run.earlier = list(earlier)
+                try:
+                    run.path.mkdir()
+                    run._write_settings()
+                    yield run
+                    run._appear(itertools.chain([path], places))
+                except BaseException:
+                    shutil.rmtree(hidden, ignore_errors=True)
+                    raise
         except OSError as error:
-            with contextlib.suppress(OSError):
-                run.path.rmdir()
             raise ValueError(f"{path} cannot be used ({error.strerror})") from None
-        return run
 
     @classmethod
     def open(cls, path: Path, config: Config, keep: int) -> "Run":
@@ -95,43 +101,46 @@ class Run:
             raise ValueError(f"{path} cannot be used ({error.strerror})") from None
         return run
 
+    def begin(self, state: dict[str, Any]) -> None:
+        """Write the first checkpoint of a new run.
+
+        Raises:
+            OSError: the directory refuses it.
+        """
+        checkpoint.save(self.path / f"checkpoint-{state['trial']}.pt", state)
+        self.saved = state["trial"]
+
     def rewind(self, state: dict[str, Any]) -> None:
         """Go back to a state: cut the trial table to its trials, set newer checkpoints aside.
 
         Raises:
             ValueError: the directory cannot be written.
         """
-        table, trial = self.path / "trials.csv", state["trial"]
+        file, trial = self.path / "trials.csv", state["trial"]
         try:
             # First, so that there is a checkpoint to go on from whatever happens next.
-            checkpoint.save(self.path / f"checkpoint-{trial}.pt", state)
+            self.begin(state)
             for leftover in self.path.glob(".*.tmp"):
                 leftover.unlink()
             newer = [p for p in checkpoint.checkpoints(self.path) if checkpoint.number(p) > trial]
-            for path in [*newer, table] if newer else []:
+            for path in [*newer, file] if newer else []:
                 with contextlib.suppress(FileNotFoundError):
                     shutil.copyfile(path, path.with_name(f"{path.name}.unused"))
-            text = table.read_bytes().decode(errors="replace") if table.exists() else ""
-            whole = [row for row in text.splitlines(keepends=True) if row.endswith("\n")]
-            self.rows = whole[:1] + [r for r in whole[1:] if _number(r) in range(1, trial + 1)]
-            if trial and [_number(row) for row in self.rows[1:]] != [*range(1, trial + 1)]:
-                say(f"warning: {table} lacks trials before {trial + 1}; see {table.name}.unused")
-                table.with_name(f"{table.name}.unused").write_bytes(text.encode())
+            self.rows = table.take(file, trial, max(trial, self.config.trials))
             self._write_table()
             self._note_versions()
             self._write_settings()
             for path in newer:
                 path.unlink()
-            self.saved = trial
         except OSError as error:
             raise ValueError(f"{self.path} cannot be written ({error.strerror})") from None
 
     def record(self, row: dict[str, Any]) -> None:
         """Add the line of a trial to trials.csv; floats are written to their last bit."""
         if not self.rows:
-            self.rows.append(_line(row))
+            self.rows.append(table.line(row))
         columns = self.rows[0].strip().split(",")
-        self.rows.append(_line([row.get(column, "") for column in columns]))
+        self.rows.append(table.line([row.get(column, "") for column in columns]))
         with self._forgiving("trials.csv"):
             if self._table_is_whole():
                 size, self.table_size = self.table_size, 0  # unknown if the next lines fail
@@ -201,6 +210,22 @@ class Run:
             reason = error.strerror or str(error)
             self.warn(what, f"{what} cannot be written to {self.path} ({reason}); will try again")
 
+    def _appear(self, places: Iterable[Path]) -> None:
+        """Move to the first place that is free; what is whole appears at once."""
+        for path in places:
+            try:
+                self.path = self.path.rename(path)
+            except OSError as error:
+                if error.errno not in (errno.EEXIST, errno.ENOTEMPTY, errno.ENOTDIR):
+                    raise
+            else:
+                checkpoint.sync_directory(path.parent)
+                self._acquire()
+                return
+        raise ValueError(
+            f"{path} exists: choose another --name, or go on with --resume {quoted(path)}"
+        )
+
     def _is_ours(self) -> bool:
         """The directory is still the one that this process took, not a later one of that name."""
         try:
@@ -263,8 +288,8 @@ class Run:
         checkpoint.write_atomically(self.path / "config.json", f"{text}\n".encode())
 
     def _table_is_whole(self) -> bool:
-        table = self.path / "trials.csv"
-        return self.table_size > 0 and table.exists() and table.stat().st_size == self.table_size
+        file = self.path / "trials.csv"
+        return self.table_size > 0 and file.exists() and file.stat().st_size == self.table_size
 
     def _write_table(self) -> None:
         if not self.rows:
@@ -283,7 +308,7 @@ def load_config(path: Path) -> Config:
     """
     file = Path(path) / "config.json"
     try:
-        data = json.loads(file.read_bytes())
+        data = json.loads(checkpoint.read_file(file, LARGEST_SETTINGS))
         return from_dict(data["config"])
     except OSError as error:
         raise ValueError(f"{path}: not a run directory (config.json: {error.strerror})") from None
@@ -315,25 +340,3 @@ def flatten(settings: dict[str, Any], prefix: str = "") -> dict[str, Any]:
         else:
             flat[f"{prefix}{name}"] = list(value) if isinstance(value, tuple) else value
     return flat
-
-
-def default_name(config: Config) -> str:
-    """Name of a run directory, e.g. sga-sofnn-estimated-s0."""
-    return f"{config.learner.name}-{config.network}-{config.pose}-s{config.seed}"
-
-
-def first_free(path: Path) -> Path:
-    """The path, or with -2, -3 ... appended if it exists."""
-    numbered = (path.with_name(f"{path.name}-{count}") for count in itertools.count(2))
-    return next(p for p in itertools.chain([path], numbered) if not p.exists())
-
-
-def _line(cells: Any) -> str:
-    buffer = io.StringIO()
-    csv.writer(buffer, lineterminator="\n").writerow(cells)
-    return buffer.getvalue()
-
-
-def _number(row: str) -> int | None:
-    first = row.partition(",")[0]
-    return int(first) if first.isdecimal() else None

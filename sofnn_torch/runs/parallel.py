@@ -13,13 +13,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from joblib import Parallel, delayed
-from tqdm import tqdm
 
 from sofnn_torch.numerals import whole
-from sofnn_torch.runs import directory
+from sofnn_torch.progress import Progress, say
+from sofnn_torch.runs import places
 from sofnn_torch.runs.settings import Config
 from sofnn_torch.runs.signals import Interrupted, SignalTrap
-from sofnn_torch.terminal import say
+from sofnn_torch.terminal import program, quoted
 from sofnn_torch.training import RunOptions
 
 OWN = {"--seeds", "--workers", "--name", "--seed"}  # flags that the single runs do not inherit
@@ -38,37 +38,35 @@ def train(
         ValueError: the list of seeds cannot be read.
         Interrupted: after every run was saved.
     """
-    numbers = parse(listed)
+    configs = [dataclasses.replace(config, seed=number) for number in parse(listed)]
     common = [sys.executable, "-m", "sofnn_torch.cli", *_without(argv, OWN), "--quiet"]
-    jobs = []
-    for number in numbers:
-        name = options.name and f"{options.name}-s{number}"
-        name = name or directory.default_name(dataclasses.replace(config, seed=number))
-        path = directory.first_free(options.runs / name)
-        jobs.append((number, path, [*common, "--seed", str(number), "--name", path.name]))
-    failed = 0
-    with (
-        SignalTrap() as trap,
-        tqdm(
-            total=config.trials * len(jobs),
-            unit="trial",
-            desc=f"{len(jobs)} seeds",
-            disable=options.quiet,
-        ) as bar,
-    ):
+
+    def jobs():
+        for each in configs:  # a name is taken when the turn of its seed has come
+            number, name = each.seed, options.name and f"{options.name}-s{each.seed}"
+            path = places.reserve(options.runs / (name or places.default_name(each)))
+            command = [*common, "--seed", str(number), "--name", path.name]
+            yield delayed(watch)(number, path, command, bar, trap)
+
+    failed, many = 0, f"{len(configs)} seeds"
+    bar = Progress(many, config.trials * len(configs), quiet=options.quiet)
+    with SignalTrap() as trap, bar:
         parallel = Parallel(n_jobs=workers, backend="threading", return_as="generator_unordered")
-        for number, path, code, message in parallel(
-            delayed(watch)(*job, bar, trap) for job in jobs
-        ):
+        for number, path, code, message in parallel(jobs()):
             failed += code != 0
+            with contextlib.suppress(OSError):
+                path.rmdir()  # only of a run that never began is it empty
             if code == 0:
-                tqdm.write(f"{path}: done")
+                bar.print(f"{path}: done")
+            elif trap.number and code == 128 + trap.number and path.exists():
+                go_on = f"{program()} --resume {quoted(path)}"
+                say(f"seed {number}: stopped and saved; go on with: {go_on}")
             else:
                 say(f"seed {number}: {message}, {path}")
     if trap.number:
         raise Interrupted(trap.number)
     if failed:
-        say(f"{failed} of {len(jobs)} seeds failed")
+        say(f"{failed} of {many} failed")
     return 1 if failed else 0
 
 
@@ -92,7 +90,7 @@ def parse(listed: str) -> list[int]:
 
 
 def watch(
-    number: int, path: Path, command: list[str], bar: tqdm, trap: SignalTrap
+    number: int, path: Path, command: list[str], bar: Progress, trap: SignalTrap
 ) -> tuple[int, Path, int, str]:
     """Run the command of a training to its end; its number, directory, exit code and message."""
     if trap.number:

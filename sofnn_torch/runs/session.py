@@ -12,7 +12,7 @@ import torch
 from sofnn_torch.bounds import Count, Settings, Within
 from sofnn_torch.learners.learner import Learner
 from sofnn_torch.maze.env import KheperaMazeEnv
-from sofnn_torch.runs import checkpoint
+from sofnn_torch.runs import checkpoint, places
 from sofnn_torch.runs.checkpoint import CheckpointError
 from sofnn_torch.runs.directory import Run, load_config, same_settings
 from sofnn_torch.runs.factory import make_agent, make_env
@@ -20,6 +20,7 @@ from sofnn_torch.runs.provenance import make_portable
 from sofnn_torch.runs.seeding import stream
 from sofnn_torch.runs.settings import Config, from_dict
 from sofnn_torch.runs.trial import TrialRecord
+from sofnn_torch.terminal import quoted
 
 LARGE_BLOCK = 2**25 - 2**14  # bytes; just below the largest block that glibc learns to keep
 MOST_THREADS = 256  # beyond some number a system starts no more, and the process dies of it
@@ -58,7 +59,12 @@ class RunOptions(Settings):
         name = self.name
         if name is None:
             return
-        if not name.strip(". ") or Path(name).name != name or not name.isprintable():
+        if (
+            not name.strip(". ")
+            or name.startswith("-")
+            or Path(name).name != name
+            or not name.isprintable()
+        ):
             raise ValueError(f"--name must be a plain directory name, got {name!r}")
         if len(name.encode()) > LONGEST_NAME:
             raise ValueError(f"--name must have at most {LONGEST_NAME} bytes, got {name[:40]}...")
@@ -104,7 +110,7 @@ class Session:
                 place = self.run.rescue(self.state)
                 raise OSError(
                     f"{self.run.path} cannot be written; trial {self.trial} is saved outside it: "
-                    f"go on with --resume {place}"
+                    f"go on with --resume {quoted(place)}"
                 )
         finally:
             self.run.close()
@@ -147,8 +153,7 @@ def begin(config: Config, options: RunOptions) -> Session:
     """
     agent, env = build(config)
     state = _first_state(config, agent, env)
-    run = Run.create(options.runs, options.name, config, options.keep)
-    run.save(state)
+    run = _create(config, options, state)
     return Session(run, agent, env, state)
 
 
@@ -184,8 +189,7 @@ def reopen(path: Path, options: RunOptions, trials: int | None = None) -> Sessio
         if done > config.trials:
             raise ValueError(f"{path} has {done} trials already: give --trials {done} or more")
         if run is None:
-            run = Run.create(options.runs, options.name, config, options.keep)
-            run.save(state)
+            run = _create(config, options, state)
         elif done < config.trials:
             run.config = config
             run.rewind(state)
@@ -193,6 +197,15 @@ def reopen(path: Path, options: RunOptions, trials: int | None = None) -> Sessio
             run.saved = done
         undo.pop_all()
         return Session(run, agent, env, state)
+
+
+def _create(config: Config, options: RunOptions, state: dict[str, Any]) -> Run:
+    """A new run with its first checkpoint."""
+    usual = places.numbered(options.runs / places.default_name(config))
+    free = usual if options.name is None else [options.runs / options.name]
+    with Run.create(free, config, options.keep) as run:
+        run.begin(state)
+    return run
 
 
 def build(config: Config) -> tuple[Learner, KheperaMazeEnv]:
@@ -239,7 +252,9 @@ def _choose(home: Path, path: Path, config: Config) -> tuple[Path | None, dict[s
         return None, None
     file, state, problems = checkpoint.find_latest(home, check)
     if problems:
-        raise CheckpointError(f"{problems[0]}. To go on from the last good one: --resume {file}")
+        raise CheckpointError(
+            f"{problems[0]}. To go on from the last good one: --resume {quoted(file)}"
+        )
     return file, state
 
 

@@ -20,10 +20,15 @@ class Interrupted(Exception):
         self.run: Path | None = None
 
 
-class SignalTrap:
-    """Notes SIGINT and SIGTERM instead of dying of them, so that the loop can stop in order.
+# Ctrl-C, `kill`, a terminal that is closed, and what clusters send before the time is up.
+NUMBERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1)
 
-    Outside the main thread, where Python allows no handlers, it notes nothing.
+
+class SignalTrap:
+    """Notes the signals that ask to stop instead of dying of them: the loop can stop in order.
+
+    Outside the main thread, where Python allows no handlers, it notes nothing; a SIGHUP that is
+    ignored, as under `nohup`, stays so.
 
     Attributes:
         number: of the last signal, 0 as long as there was none.
@@ -35,8 +40,9 @@ class SignalTrap:
 
     def __enter__(self) -> "SignalTrap":
         if threading.current_thread() is threading.main_thread():
-            for number in (signal.SIGINT, signal.SIGTERM):
-                self._former[number] = signal.signal(number, self._note)
+            for number in NUMBERS:
+                if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
+                    self._former[number] = signal.signal(number, self._note)
         return self
 
     def __exit__(self, *_: object) -> None:

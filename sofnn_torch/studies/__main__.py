@@ -10,18 +10,20 @@ are kept, a killed one goes on where it was, and studies share the runs that the
 """
 
 import dataclasses
-import sys
+import signal
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+if __name__ == "__main__":  # Ctrl-C while libraries load: there is nothing to save yet
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+from sofnn_torch import terminal
 from sofnn_torch.bounds import Count, Settings
 from sofnn_torch.maze.optimum import optimal_steps
 from sofnn_torch.maze.robot import Physics
 from sofnn_torch.runs import parallel
-from sofnn_torch.runs.signals import Interrupted
 from sofnn_torch.studies import collecting, report, running
-from sofnn_torch.terminal import output, parse, say
 
 
 @dataclass(frozen=True)
@@ -107,15 +109,7 @@ def run(options: Options) -> int:
 
 def main() -> None:
     """Entry point of ``python -m sofnn_torch.studies``."""
-    try:
-        with output():
-            sys.exit(run(parse(Options, sys.argv[1:], __doc__)))
-    except (ValueError, OSError) as error:
-        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
-        sys.exit(2)
-    except Interrupted as stop:
-        say("stopped and saved; the same command goes on")
-        sys.exit(128 + stop.number)
+    terminal.command(run, Options, __doc__, advice="the same command goes on")
 
 
 if __name__ == "__main__":

@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import Any
 
 from joblib import Parallel, delayed
-from tqdm import tqdm
 
 from sofnn_torch import evaluate, training
 from sofnn_torch.pictures.figures import read_column
+from sofnn_torch.progress import Progress, say
 from sofnn_torch.runs import checkpoint, directory, session
 from sofnn_torch.runs.guard import Divergence
 from sofnn_torch.runs.parallel import watch
@@ -26,7 +26,6 @@ from sofnn_torch.runs.signals import Interrupted, SignalTrap
 from sofnn_torch.runs.trial import Trajectory, TrialRecord
 from sofnn_torch.studies.robustness import under_conditions
 from sofnn_torch.studies.studies import STUDIES, essence, settings
-from sofnn_torch.terminal import say
 
 EPISODES = 10  # evaluation trials of a run, for each policy
 PLAYED = "played-with.json"  # versions of the software, and the processor
@@ -108,12 +107,12 @@ def execute(jobs: Sequence[Job], workers: int) -> int:
     say(f"{len(jobs)} runs, {len(jobs) - len(todo)} of them finished")
     failed = 0
     total = sum(job.config.trials for job in todo)
-    with SignalTrap() as trap, tqdm(total=total, unit="trial", disable=not todo) as bar:
+    with SignalTrap() as trap, Progress("trials", total, quiet=not todo) as bar:
         parallel = Parallel(n_jobs=workers, backend="threading", return_as="generator_unordered")
         tasks = (delayed(watch)(i, j.path, _command(j), bar, trap) for i, j in enumerate(todo))
         for _, path, code, message in parallel(tasks):
             if not code:
-                bar.set_description(path.name)
+                bar.update(0, facts=[f"{path.name} is done"])
             elif not trap.number:
                 failed += 1
                 say(f"failed: {path}, {message}")

@@ -1,0 +1,54 @@
+"""Where runs go: their names, and how several that start at once get along."""
+
+import contextlib
+import fcntl
+import itertools
+import os
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+from sofnn_torch.runs.settings import Config
+
+UNNAMED = ".new-run"  # ending of a directory that is not yet whole
+
+
+def default_name(config: Config) -> str:
+    """Name of a run directory, e.g. sga-sofnn-estimated-s0."""
+    return f"{config.learner.name}-{config.network}-{config.pose}-s{config.seed}"
+
+
+def numbered(path: Path) -> Iterator[Path]:
+    """The path, then with -2, -3 ... appended."""
+    yield path
+    yield from (path.with_name(f"{path.name}-{count}") for count in itertools.count(2))
+
+
+def first_free(path: Path) -> Path:
+    """The path, or with -2, -3 ... appended if it exists."""
+    return next(p for p in numbered(path) if not p.exists())
+
+
+def reserve(path: Path) -> Path:
+    """Make an empty directory, numbered if need be, that a run can take the place of."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    for place in numbered(path):
+        with contextlib.suppress(FileExistsError):
+            place.mkdir()
+            return place
+    raise AssertionError("numbers end")
+
+
+@contextlib.contextmanager
+def alone(parent: Path) -> Iterator[None]:
+    """Inside, no other process makes a run in this directory; what killed ones left is removed."""
+    parent.mkdir(parents=True, exist_ok=True)
+    descriptor = os.open(parent, os.O_RDONLY)
+    try:
+        with contextlib.suppress(OSError):  # some file systems cannot lock a directory
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+            for leftover in parent.glob(f".*{UNNAMED}"):
+                shutil.rmtree(leftover, ignore_errors=True)
+        yield
+    finally:
+        os.close(descriptor)
