@@ -304,3 +304,71 @@ def test_a_film_for_a_full_disk_says_so_in_one_line(ending, tmp_path, monkeypatc
     with pytest.raises(OSError, match=r"No space left on device: '\S+/film\.\w+'"):
         evaluate.write_video(tmp_path / f"film.{ending}", settings(), None, 0, False)
     assert not list(tmp_path.iterdir())
+
+
+def test_every_row_of_the_table_is_its_own_quantity_in_its_printed_unit():
+    records = [
+        replace(
+            RECORD,
+            steps=500 + 100 * late,
+            collisions=2 + late,
+            subgoals=9,
+            pose_error=0.004,
+            pose_error_max=0.012,
+            heading_error=math.radians(3),
+        )
+        for late in (False, True)
+    ]
+    records.append(replace(records[0], steps=20_000, success=False))
+    view = evaluate.table(evaluate.summarise(records, optimum=440))
+    names, values = ([*column.cells] for column in view.columns[:2])
+    assert dict(zip(names, values, strict=True)) == {
+        "trials that reached the goal, %": "66.7",
+        "steps to the goal": "550.0",
+        "  over the kinematic optimum": "1.250",
+        "steps of all trials": "7033.3",
+        "collisions per trial": "2.33",
+        "position error, mean, mm": "4.00",
+        "position error, largest, mm": "12.00",
+        "heading error, mean, degrees": "3.00",
+    }
+
+
+@pytest.mark.parametrize(
+    ("flags", "explore", "policy"), [([], False, "mean"), (["--explore"], True, "sampled")]
+)
+def test_the_policy_that_is_named_is_the_one_that_plays_and_is_filmed(
+    trained, tmp_path, monkeypatch, capsys, flags, explore, policy
+):
+    played, filmed = [], []
+
+    def frames(config, agent, seed, explore, **_):
+        filmed.append((seed, explore))
+        return iter([np.zeros((32, 32, 3), np.uint8)] * 2)
+
+    def evaluated(config, agent, episodes, explore, seed, *_):
+        played.append((episodes, seed, explore))
+        return [RECORD]
+
+    monkeypatch.setattr(evaluate, "evaluate", evaluated)
+    monkeypatch.setattr(evaluate, "film", frames)
+    file = tmp_path / "result.json"
+    for suffix in (".mp4", ".gif"):
+        film = tmp_path / f"film{suffix}"
+        words = [trained, "--seed", 4, "--episodes", 3, "--json", file, "--video", film]
+        assert call(monkeypatch, *words, *flags) == 0
+    assert played == [(3, 4, explore)] * 2 and filmed == [(4, explore)] * 2
+    assert f"with {policy} actions" in capsys.readouterr().out
+    result = json.loads(file.read_text())
+    assert (result["policy"], result["seed"], result["trials_learned"]) == (policy, 4, 2)
+    assert result["versions"]["instructions"]
+
+
+def test_the_best_checkpoint_is_played_if_asked_for(trained, tmp_path):
+    copy = tmp_path / "run"
+    copy.mkdir()
+    for name in ("config.json", "checkpoint-2.pt"):
+        (copy / name).write_bytes((trained / name).read_bytes())
+    (copy / "best.pt").write_bytes((trained / "checkpoint-2.pt").read_bytes())
+    assert evaluate.load(copy)[2] == copy / "checkpoint-2.pt"
+    assert evaluate.load(copy, best=True)[2] == copy / "best.pt"

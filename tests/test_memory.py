@@ -197,3 +197,21 @@ def test_a_copy_made_by_state_replays_alike(make):
 def test_sga_needs_the_learned_baseline_to_replay():
     with pytest.raises(ValueError, match="baseline"):
         sga_learner(baseline="constant", replays=1)
+
+
+@pytest.mark.parametrize("make", [q_learner, sga_learner])
+def test_learners_remember_as_many_decisions_as_they_are_told(make):
+    agent = make(replays=1, memory=2)
+    play(agent)
+    assert len(agent.memory) == len(agent.memory.rows) == 2
+
+
+@pytest.mark.parametrize("make", [q_learner, sga_learner])
+@pytest.mark.parametrize("ending", ["terminated", "truncated"])
+def test_only_the_end_of_the_way_is_remembered_as_an_end(make, ending):
+    agent = make(replays=1)
+    agent.start(STATES[0])
+    agent.step(0.5, STATES[1], ending == "terminated", ending == "truncated")
+    seen = agent.memory.sample(1, np.random.default_rng(0), torch.zeros(1, dtype=torch.float64))
+    assert (seen["reward"] == 0.5).all()
+    assert (seen["continues"] == (ending == "truncated")).all()

@@ -469,3 +469,18 @@ def test_a_gpu_gives_the_same_outputs():
     net.cuda()
     torch.testing.assert_close(net(x.cuda()).cpu(), expected)
     assert net.grow(torch.tensor([9.0, 9.0, 0.0]).double().cuda())
+
+
+def test_a_grid_begins_with_the_consequents_that_it_is_given():
+    initial = [-7.0, 0.25, 300.0]
+    net = grid(POSE, (2, 2, 2), 3, initial=initial)
+    assert net.consequents.tolist() == [initial] * 8
+
+
+def test_pruning_keeps_the_usage_of_the_rest():
+    net = grown(30, block_size=8)
+    net.usage.copy_(torch.arange(float(net.n_rules)))
+    keep = torch.arange(net.n_rules) % 3 > 0
+    expected = net.usage[keep].tolist()
+    net.prune(keep)
+    assert net.usage.tolist() == expected and len(expected) > 3

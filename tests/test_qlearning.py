@@ -283,3 +283,13 @@ def test_a_grown_learner_restores_bit_for_bit(coding):
 def test_wrong_settings_are_refused(settings, message):
     with pytest.raises(ValueError, match=message):
         learner(**settings)
+
+
+@pytest.mark.parametrize("part", ["centre", "width"])
+def test_a_rate_moves_its_own_part_of_the_antecedents_alone(part):
+    agent = learner(rules=5, **{f"rate_{part}": 1e-3})
+    before = {"centre": agent.net.centres.clone(), "width": agent.net.widths.clone()}
+    agent.start(np.array([0.1, -0.2, 0.5]))
+    agent.step(1.0, np.array([0.2, -0.2, 0.5]), True)
+    after = {"centre": agent.net.centres, "width": agent.net.widths}
+    assert [name for name in before if not torch.equal(before[name], after[name])] == [part]

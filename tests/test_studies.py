@@ -405,7 +405,7 @@ def test_tables_and_captions_say_which_seeds_diverged(written, tmp_path):
     assert report.write(tmp_path) == 0
     text = (tmp_path / "section5.md").read_text()
     assert f"| {none} |  | 8 | 0; 8 of 8 seeds diverged |{' - |' * 8}\n" in text
-    assert f"| {half} |  | 8 | 8; 4 of 8 seeds diverged | 2" in text
+    assert f"| {half} |  | 8 | 4; 4 of 8 seeds diverged | 2" in text
     assert "0 of 8 seeds (0 to 32 %); 8 of 8 seeds diverged" in text
     assert text.count("SOFNN: the median ends where a seed diverged.") == 2  # Figs 8 and 9
     assert "A seed *diverged* if" in text
@@ -441,7 +441,7 @@ def test_data_of_runs_become_a_page(tmp_path, monkeypatch):
     assert trained["instructions"] != played["instructions"] == "AVX7"
     assert data.column("sga-rule", "seed").tolist() == [0, 1]
     assert data.column("sga-rule", "total_steps").tolist() == [60, 60]
-    assert [curve.tolist() for curve in data.curves("sga-rule", "steps")] == [[30, 30]] * 2
+    assert [curve.tolist() for curve in data.curves("sga-rule", "steps").values()] == [[30, 30]] * 2
     assert data.info["arms"]["sga-rule"]["config"]["maze"]["max_steps"] == 30
     (made,) = data.info["made_with"]
     assert made.endswith("--study growth --arms sga-rule --seeds 0-1 --trials 2 --max-steps 30")

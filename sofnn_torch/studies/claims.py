@@ -40,10 +40,14 @@ def judge(measured: Estimate, low: float, high: float) -> str:
 
 
 def arriving(data: Data, arm: str) -> tuple[int, int]:
-    """How many seeds of an arm arrive, and how many there are."""
+    """How many seeds of an arm arrive, and how many there are; one that diverged does not."""
     limit = data.info["arms"][arm]["config"]["maze"]["max_steps"]
-    runs = data.curves(arm, "steps")
-    arrived = [np.mean(steps[-LAST:] < limit) >= 0.9 for steps in runs]
+    done = {row["seed"] for row in data.rows if row["arm"] == arm and row["status"] == "done"}
+    arrived = [
+        np.mean(steps[-LAST:] < limit) >= 0.9
+        for seed, steps in data.curves(arm, "steps").items()
+        if seed in done
+    ]
     return sum(arrived), len(data.column(arm, "trials"))
 
 

@@ -129,7 +129,7 @@ def _diverged(data: Data, names: dict[str, str]) -> str:
 
 
 def _curves(data: Data, names: dict[str, str], quantity: str = "steps") -> dict[str, Any]:
-    found = {label: data.curves(arm, quantity) for label, arm in names.items()}
+    found = {label: [*data.curves(arm, quantity).values()] for label, arm in names.items()}
     return {label: runs for label, runs in found.items() if runs}
 
 

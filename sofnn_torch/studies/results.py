@@ -49,11 +49,11 @@ class Data:
             return text
         return f"{text}; {count} of {sum(row['arm'] in arms for row in self.rows)} seeds diverged"
 
-    def curves(self, arm: str, quantity: str) -> list[NDArray[np.float64]]:
-        """A quantity of every trial, for each seed of an arm."""
+    def curves(self, arm: str, quantity: str) -> dict[int, NDArray[np.float64]]:
+        """A quantity of every trial, by the seeds of an arm."""
         rows = self.tables.get("curves", [])
         chosen = [row for row in rows if (row["arm"], row["quantity"]) == (arm, quantity)]
-        return [np.array(str(row["values"]).split(), float) for row in chosen]
+        return {row["seed"]: np.array(str(row["values"]).split(), float) for row in chosen}
 
 
 def read(out: Path, name: str) -> Data:

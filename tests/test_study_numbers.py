@@ -1,0 +1,407 @@
+"""Every number on a page of results comes from the right rows: data by hand, one at a time."""
+
+import dataclasses
+import json
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from sofnn_torch.pictures import figures
+from sofnn_torch.runs.trial import Trajectory
+from sofnn_torch.studies import claims, collecting, drawing, report, results, robustness, running
+from sofnn_torch.studies.studies import settings
+
+OPTIMUM, LIMIT = 468, 20_000
+POSE_NAMES = ("x", "y", "heading", "x_estimated", "y_estimated", "heading_estimated")
+USUAL = {
+    "status": "done",
+    "trials": 100,
+    "trials_to_learn": 20,
+    "greedy_success": 1.0,
+    "greedy_steps": 500,
+    "greedy_collisions": 1,
+    "sampled_success": 1.0,
+    "sampled_steps": 500,
+    "sampled_collisions": 1,
+    "rules": 800,
+}
+
+
+def study(arms, name="section5", seeds=4, **tables):
+    """Data of a study in which all seeds of an arm are alike: what differs from `USUAL` by arm."""
+    rows = [
+        {"arm": arm, "seed": seed} | USUAL | changes
+        for arm, changes in arms.items()
+        for seed in range(seeds)
+    ]
+    config = {"maze": {"max_steps": LIMIT}, "trials": 100}
+    kept = {"changes": "", "seeds": [*range(seeds)], "config": config}
+    info = {"study": name, "optimum": OPTIMUM, "arms": dict.fromkeys(arms, kept)}
+    return results.Data(info, rows, tables)
+
+
+def curves(arm, *runs, quantity="steps"):
+    """Rows of the table of curves, a run for each seed."""
+    return [
+        {"arm": arm, "seed": seed, "quantity": quantity, "values": " ".join(map(str, values))}
+        for seed, values in enumerate(runs)
+    ]
+
+
+# ----------------------------------------------------------------------------- claims, goals
+
+
+def test_an_arriving_seed_reaches_the_goal_in_nine_of_its_last_ten_trials_and_does_not_diverge():
+    early = [LIMIT] * 30
+    runs = [early + [500] * 10, early + [500] * 9 + [LIMIT], early + [500] * 8 + [LIMIT] * 2]
+    runs += [[500] * 30 + [LIMIT] * 10, early + [500] * 10]
+    data = study({"sga-sofnn-estimated": {}}, seeds=5, curves=curves("sga-sofnn-estimated", *runs))
+    assert claims.arriving(data, "sga-sofnn-estimated") == (3, 5)
+    data.rows[4]["status"] = "diverged"
+    assert claims.arriving(data, "sga-sofnn-estimated") == (2, 5)
+
+
+def test_claims_compare_the_sampled_policies():
+    arms = {f"{agent}-sofnn-{pose}": {} for agent in ("sga", "q") for pose in ("estimated", "true")}
+    arms["sga-sofnn-estimated"] = {"sampled_steps": 600, "rules": 912}
+    arms["q-sofnn-estimated"] = {"rules": 10_024}
+    arms["sga-fixed-estimated"] = {"trials_to_learn": 80}
+    found = {
+        claim: (measured, verdict) for claim, _, measured, verdict in claims.claims(study(arms))
+    }
+    said = {
+        "Fig. 10, SGA": ("1.20", claims.FAILS),
+        "Fig. 10, Q": ("1.00", claims.HOLDS),
+        "Text: both": ("1.20", claims.FAILS),
+        "Fig. 9": ("10.99", claims.HOLDS),
+        "Fig. 7, SGA: SOFNN learns": ("0.25", claims.HOLDS),
+    }
+    for begin, expected in said.items():
+        assert [row for claim, row in found.items() if claim.startswith(begin)] == [expected], begin
+
+
+def test_the_closing_table_has_both_policies():
+    changes = {"greedy_steps": 500, "sampled_steps": 600, "rules": 700}
+    data = study({"q-sofnn-estimated": changes, "q-fixed-estimated": {"rules": 1152}})
+    rows = [row[1:] for row in claims.closing_table(data)]
+    assert rows == [
+        ("528.9", "500.0", "1.068"),
+        ("528.9", "600.0", "1.282"),
+        ("10,024", "700", ""),
+        (r"9,216 \*", "1,152", ""),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("changes", "reached"),
+    [
+        ({}, "yes yes yes yes"),
+        ({"greedy_success": 0.98}, "no yes yes yes"),
+        ({"greedy_steps": 516.1}, "yes no no yes"),
+        ({"trials_to_learn": 51}, "yes yes yes no"),
+        ({"trials_to_learn": math.nan, "trials": 30}, "yes yes yes no"),
+        ({"sampled_success": 0.5, "sampled_steps": 900}, "yes yes yes yes"),
+    ],
+)
+def test_goals_are_of_the_greedy_policy(changes, reached):
+    data = study({"sga-sofnn-estimated": changes})
+    assert " ".join(yes for *_, yes in claims.goals(data)) == reached
+
+
+def test_a_goal_within_1_10_of_the_optimum_is_not_within_1_12():
+    for steps, reached in ((1.09 * OPTIMUM, "yes"), (1.12 * OPTIMUM, "no")):
+        data = study({"q-sofnn-estimated": {"greedy_steps": steps}})
+        assert [yes for _, goal, _, yes in claims.goals(data) if "1.10" in goal] == [reached]
+
+
+def through(zones, errors):
+    """A path from outside into each zone and out again, with an error [m] at each pose."""
+    points = [
+        (x + step, y) for x, y in zones for step in (-0.2, 0.0, 0.2)
+    ]  # outside, in the middle, outside
+    true = np.array([[x, y, 0.0] for x, y in points])
+    return Trajectory(true, true + np.array([[error, 0, 0] for error in errors]))
+
+
+@pytest.mark.parametrize(
+    ("errors", "twice"),
+    [
+        ([0.02, 0, 0.01, 0.05, 0, 0.02], 1),
+        ([0.02, 0, 0.01, 0.05, 0.03, 0.02], 0),  # not at the second
+        ([0, 0.03, 0.01, 0.05, 0, 0.02], 0),  # before the first, not after
+    ],
+)
+def test_resets_count_where_the_error_ends_at_both_subgoals(errors, twice, monkeypatch):
+    plan = claims.Physics().plan
+    path = through(plan.subgoals, errors)
+    monkeypatch.setattr(claims, "last_paths", lambda data, arm: {0: path})
+    assert claims.resets(None, "arm") == (twice, 1, pytest.approx(0.05))
+    data = study({"sga-sofnn-estimated": {}})
+    measured = {claim[:7]: text for claim, _, text, _ in claims.claims(data)}
+    assert measured["Fig. 11"] == f"{twice} of 1 paths; largest error 50 mm (median)"
+
+
+# ------------------------------------------------------------------------------ tables, pages
+
+
+def test_each_column_of_the_main_table_is_what_its_head_says():
+    arms = {"sga-default": {}, "sga-other": {}}
+    arms["sga-default"] = {"greedy_steps": 400}
+    arms["sga-other"] = {
+        "trials_to_learn": 33,
+        "greedy_success": 0.9,
+        "greedy_steps": 600,
+        "greedy_collisions": 7,
+        "sampled_success": 0.8,
+        "sampled_steps": 700,
+        "sampled_collisions": 2.5,
+        "rules": 1234,
+    }
+    table = report.arm_table(study(arms, "ablation"), [*arms]).splitlines()
+    head, row = ([cell.strip() for cell in line.split("|")[1:-1]] for line in (table[0], table[3]))
+    assert dict(zip(head, row, strict=True)) == {
+        "arm": "sga-other",
+        "seeds": "4",
+        "arriving": "0",
+        "trials to learn": "33",
+        "success, greedy [%]": "90.0",
+        "steps, greedy": "600",
+        "over the optimum": "1.28",
+        "over the default": "1.50",
+        "success, sampled [%]": "80.0",
+        "steps, sampled": "700",
+        "collisions a trial": "2.5",
+        "rules": "1,234",
+    }
+
+
+def condition(seed, policy, success, steps):
+    key = {"arm": "q-sofnn-estimated", "seed": seed, "group": "motor noise [%]", "value": 10.0}
+    return key | {"policy": policy, "success": success, "steps": steps, "collisions": 0}
+
+
+def test_conditions_are_tabled_for_the_greedy_policy():
+    rows = [
+        condition(seed, "greedy", success, steps)
+        for seed, (success, steps) in enumerate([(1, 400), (1, 500), (0.7, 900)])
+    ]
+    rows += [condition(seed, "sampled", 0.1, 2000) for seed in range(3)]
+    data = study({"q-sofnn-estimated": {}}, "robustness", conditions=rows)
+    line = report.condition_table(data).splitlines()[-1]
+    _, noise, success, steps, _ = (cell.strip() for cell in line.split("|"))
+    assert noise == "motor noise 10 [%]"
+    assert success.startswith("90 (") and steps.startswith("500 (")
+
+
+def test_conditions_are_drawn_for_the_greedy_policy():
+    rows = [condition(seed, "greedy", 1, 400 + seed) for seed in range(3)]
+    rows += [condition(seed, "sampled", 0.1, 2000) for seed in range(3)]
+    data = study({"q-sofnn-estimated": {}}, "robustness", conditions=rows)
+    figure = drawing.robustness(data)
+    heights = [line.get_ydata() for ax in figure.axes for line in ax.lines if len(line.get_ydata())]
+    drawn = {float(y) for line in heights for y in line}
+    assert 401 in drawn and not {2000, 0.1, 10} & drawn
+
+
+def test_hours_are_hours():
+    info = {"study": "growth", "commits": ["abc"], "versions": [{"torch": "2"}], "made_with": []}
+    info |= {"runs": 3, "wall_seconds": 7200, "cpu_seconds": 1800}
+    assert "2.00 hours of wall time and 0.50 of processor time" in report.provenance(info)
+
+
+def test_arms_of_equal_settings_and_seeds_are_shown_once():
+    data = study({"sga-default": {}, "sga-same": {}})
+    assert data.arms() == ["sga-default"]
+
+
+# --------------------------------------------------------------------------------- statistics
+
+
+def test_ratios_are_of_medians_and_means_are_means():
+    skewed, even = np.array([1.0, 1.0, 10.0]), np.array([2.0, 2.0, 2.0])
+    assert results.ratio(skewed, even).value == 0.5
+    assert results.mean(skewed).value == 4 and results.median(skewed).value == 1
+
+
+def test_the_interval_of_a_mean_of_many_is_that_of_a_normal_distribution():
+    data = np.random.default_rng(3).normal(0, 1, 900)
+    estimate = results.mean(data)
+    half = 1.96 * data.std() / math.sqrt(len(data))
+    assert (estimate.high - estimate.low) / 2 == pytest.approx(half, rel=0.06)
+
+
+def test_a_run_that_never_learns_counts_as_one_trial_more_than_it_had():
+    data = study({"q-x": {"trials_to_learn": math.nan, "trials": 60}})
+    assert results.censored(data, "q-x").tolist() == [61] * 4
+
+
+# ------------------------------------------------------------------------------- collected data
+
+
+def test_a_row_sums_up_one_run(tmp_path):
+    head = "trial,steps,success,rules\n"
+    (tmp_path / "trials.csv").write_text(head + "1,20000,False,5\n2,500,True,6\n3,400,True,9\n")
+    (tmp_path / "seconds.csv").write_text("10.0,1.0\n30.0,2.5\n")
+    records = [
+        {"success": True, "steps": 450, "collisions": 0},
+        {"success": False, "steps": 20_000, "collisions": 3},
+    ]
+    evaluation = {"greedy": records, "sampled": records[:1]}
+    (tmp_path / "evaluation.json").write_text(json.dumps(evaluation))
+    row = collecting._row(tmp_path, settings({"agent": "sga"}), OPTIMUM)
+    assert math.isnan(row.pop("trials_to_learn"))
+    assert row == {
+        "status": "done",
+        "trials": settings({"agent": "sga"}).trials,
+        "greedy_success": 0.5,
+        "greedy_steps": 10_225,
+        "greedy_collisions": 1.5,
+        "sampled_success": 1,
+        "sampled_steps": 450,
+        "sampled_collisions": 0,
+        "rules": 9,
+        "total_steps": 20_900,
+        "wall_seconds": 40,
+        "cpu_seconds": 3.5,
+    }
+
+
+def test_paths_keep_true_and_estimated_poses_apart(tmp_path):
+    last = {"last_trial": {"true": [[1, 2, 3], [7, 8, 9]], "estimated": [[4, 5, 6], [0, 0, 0]]}}
+    (tmp_path / "evaluation.json").write_text(json.dumps(last))
+    rows = [*collecting._path(tmp_path)]
+    assert rows[0] == {"decision": 0} | dict(zip(POSE_NAMES, range(1, 7), strict=True))
+    data = study({}, paths=[{"arm": "a", "seed": 3.0} | row for row in rows])
+    (path,) = drawing.last_paths(data, "a").values()
+    assert path.true.tolist() == [[1, 2, 3], [7, 8, 9]]
+    assert path.estimated.tolist() == [[4, 5, 6], [0, 0, 0]]
+
+
+# -------------------------------------------------------------------------------------- figures
+
+
+def test_each_figure_shows_the_arms_that_its_caption_names(monkeypatch):
+    names = [
+        f"{agent}-{network}-{pose}"
+        for agent in ("sga", "q")
+        for network in ("sofnn", "fixed")
+        for pose in ("estimated", "true")
+    ]
+    table = []
+    for number, arm in enumerate(names):
+        table += curves(arm, [1000 + number] * 3)
+        table += curves(arm, [number] * 3, quantity="rules")
+    drawn = []
+    monkeypatch.setattr(drawing, "maze", lambda plan: None)
+    monkeypatch.setattr(drawing, "_legend_above", lambda ax, columns=2: None)
+    monkeypatch.setattr(
+        figures,
+        "learning_curves",
+        lambda arms, ax, *_, **__: drawn.append(
+            {label: int(run[0]) for label, (run,) in arms.items()}
+        ),
+    )
+    shown = {}
+    for name, _, text in drawing._of_the_paper(study({arm: {} for arm in names}, curves=table)):
+        shown[name], drawn[:] = (text[: text.index(".", 5)], *drawn), []
+    at = {arm: number for number, arm in enumerate(names)}
+    steps = {arm: 1000 + number for arm, number in at.items()}
+    assert shown["fig7"][0] == "Fig. 7: steps to the goal, SGA, estimated pose"
+    for figure, agent in (("fig7", "sga"), ("fig8", "q")):
+        assert shown[figure][1] == {
+            "SOFNN": steps[f"{agent}-sofnn-estimated"],
+            "FSFNN": steps[f"{agent}-fixed-estimated"],
+        }
+    assert shown["fig9"][1] == {
+        "SGA, SOFNN": at["sga-sofnn-estimated"],
+        "SGA, FSFNN": at["sga-fixed-estimated"],
+        "Q-learning, SOFNN": at["q-sofnn-estimated"],
+        "Q-learning, FSFNN": at["q-fixed-estimated"],
+    }
+    assert shown["fig10"][1:] == tuple(
+        {f"{pose} pose": steps[f"{agent}-sofnn-{pose}"] for pose in ("estimated", "true")}
+        for agent in ("sga", "q")
+    )
+
+
+def test_the_path_of_median_length_is_the_dark_one():
+    poses = {seed: np.zeros((length, 3)) for seed, length in enumerate([9, 3, 5])}
+    _, (ax,) = figures.canvas()
+    drawing.pose_errors(
+        {seed: Trajectory(p, p) for seed, p in poses.items()}, ax, drawing.Physics().plan
+    )
+    lengths = {line.get_color(): len(line.get_ydata()) for line in ax.lines}
+    assert lengths[figures.BLUE] == 5
+
+
+# ---------------------------------------------------------------------------- other conditions
+
+
+@pytest.mark.parametrize(
+    ("group", "value", "change"),
+    [
+        ("motor noise", 15, {"motor_noise": 0.15}),
+        ("wheel radius", -3, {"wheel_radius_scale": 0.97}),
+        ("wheel base", 1.5, {"wheel_base_scale": 1.015}),
+        ("scatter", 50, {"start": 0.5}),
+    ],
+)
+def test_a_condition_changes_what_its_name_says(group, value, change):
+    (values,) = (v for name, v in robustness.CONDITIONS.items() if name.startswith(group))
+    assert values[value] == pytest.approx(change)
+
+
+def test_the_start_is_scattered_to_both_sides_by_at_most_30_mm_and_20_degrees():
+    env = robustness.changed_maze(settings({"agent": "sga"}), {"start": 1.0}, 0)
+    poses = np.array([env.reset(seed=0)[1]["true_pose"] for _ in range(40)])
+    offset = poses - env.unwrapped.plan.start
+    env.close()
+    most = np.array([0.03, 0.03, math.radians(20)])
+    assert (offset.min(0) < -0.6 * most).all() and (offset.max(0) > 0.6 * most).all()
+    assert (abs(offset) <= most + 1e-9).all()
+
+
+def test_the_greedy_policy_is_played_without_chance_in_other_conditions(monkeypatch):
+    config, explored = settings({"agent": "sga"}), []
+    record = SimpleNamespace(success=True, steps=1, collisions=0)
+
+    def play(env, agent, learn, explore):
+        explored.append(explore)
+        return record, None
+
+    monkeypatch.setattr(robustness, "CONDITIONS", {"noise": {0: {"motor_noise": 0.0}}})
+    agent = SimpleNamespace(reseed=lambda seed: None)
+    monkeypatch.setattr(robustness.evaluate, "load", lambda path: (config, agent, None, None))
+    monkeypatch.setattr(robustness, "play", play)
+    rows = robustness.under_conditions("run")
+    assert [row["policy"] for row in rows] == ["greedy", "sampled"]
+    assert explored == [False] * robustness.EPISODES + [True] * robustness.EPISODES
+
+
+def test_the_greedy_policy_is_evaluated_without_chance_and_the_last_path_is_kept(
+    tmp_path, monkeypatch
+):
+    played = []
+
+    @dataclasses.dataclass
+    class Record:
+        steps: int
+
+    def evaluated(config, agent, episodes, explore, seed):
+        played.append((episodes, explore, seed))
+        return [Record(2 if explore else 1)]
+
+    true, estimated = np.array([[1.0, 2, 3]]), np.array([[4.0, 5, 6]])
+    config = settings({"agent": "sga"}, seed=7)
+    monkeypatch.setattr(running.training, "train", lambda *_: None)
+    monkeypatch.setattr(running.evaluate, "load", lambda path: (config, None, None, None))
+    monkeypatch.setattr(running.evaluate, "evaluate", evaluated)
+    monkeypatch.setattr(running, "read_column", lambda path, column: np.array([0.0, 1.0]))
+    last = Record(9), Trajectory(true, estimated)
+    monkeypatch.setattr(running, "last_trial", lambda path: last)
+    data = running._train_and_evaluate(tmp_path, config)
+    assert played == [(running.EPISODES, False, 1007), (running.EPISODES, True, 1007)]
+    assert (data["greedy"], data["sampled"]) == ([{"steps": 1}], [{"steps": 2}])
+    assert data["last_trial"] == {"steps": 9, "true": [[1, 2, 3]], "estimated": [[4, 5, 6]]}
