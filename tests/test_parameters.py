@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 from torch import nn
+from torch.nn.utils import parametrize, prune
 
 from sofnn_torch import SOFNN
 
@@ -134,9 +135,9 @@ def test_shared_memory_is_shared_and_grows_no_more():
 def test_types_change_as_in_any_module(dtype):
     net = grown().to(dtype)
     assert {p.dtype for p in net.parameters()} == {dtype} == {net.traces.dtype}
-    assert net.centres.dtype == dtype and net(X[:8]).shape == (8, 1)
+    assert net.centres.dtype == dtype and net(X[:8].to(dtype)).dtype == dtype
     if dtype == torch.double:
-        agrees(net)
+        agrees(net, X.double())
         assert net.grow(torch.tensor([7.0, 7.0, 7.0]))
 
 
@@ -223,8 +224,8 @@ def test_a_state_that_carries_a_gradient_leaves_none_in_the_network():
 @pytest.mark.parametrize(
     "act",
     [
-        lambda p: nn.utils.prune.random_unstructured(p, "0", 0.5),
-        lambda p: nn.utils.parametrize.register_parametrization(p, "0", nn.Identity()),
+        lambda p: prune.random_unstructured(p, "0", 0.5),
+        lambda p: parametrize.register_parametrization(p, "0", nn.Identity()),
         lambda p: p.append(nn.Parameter(torch.zeros(3, 4))),
         lambda p: p.__setitem__(0, nn.Parameter(torch.zeros(3, 16))),
     ],
