@@ -11,6 +11,7 @@ directory is not changed.
 """
 
 import dataclasses
+import itertools
 import json
 import math
 import warnings
@@ -34,7 +35,7 @@ from sofnn_torch.runs import checkpoint
 from sofnn_torch.runs.directory import same_settings, versions
 from sofnn_torch.runs.factory import make_agent, make_env
 from sofnn_torch.runs.session import arithmetic, saved_config
-from sofnn_torch.runs.settings import Config
+from sofnn_torch.runs.settings import MAZE, Config
 from sofnn_torch.runs.trial import TrialRecord
 from sofnn_torch.terminal import command, plural, say
 from sofnn_torch.training import play
@@ -193,25 +194,25 @@ def summarise(records: Sequence[TrialRecord], optimum: float | None = None) -> d
         records: the trials.
         optimum: steps of the best noise-free run through the maze, if known.
     """
+    measured = [r.measures for r in records]
+    rows = {name: mean([m[name] for m in measured]) for name in measured[0] if name in PRINTED}
+    rows |= {"return": mean([r.reward for r in records]), "steps": mean([r.steps for r in records])}
+    if records[0].success is None:
+        return rows
     arrived = [r.steps for r in records if r.success]
-    rows = {
-        "success": proportion(len(arrived), len(records)),
-        "steps": mean([r.steps for r in records]),
-        "steps_to_goal": mean(arrived),
-        "collisions": mean([r.collisions for r in records]),
-        "pose_error": mean([r.pose_error for r in records]),
-        "pose_error_max": mean([r.pose_error_max for r in records]),
-        "heading_error": mean([r.heading_error for r in records]),
-    }
+    rows |= {"success": proportion(len(arrived), len(records)), "steps_to_goal": mean(arrived)}
     if optimum:
         scaled = (value / optimum for value in dataclasses.astuple(rows["steps_to_goal"]))
         rows["steps_over_optimum"] = Estimate(*scaled)
     return rows
 
 
+NONE = Estimate(math.nan, math.nan, math.nan)
+
 # Name in the results -> text, factor to the printed unit, decimals.
 PRINTED: dict[str, tuple[str, float, int]] = {
     "success": ("trials that reached the goal, %", 100, 1),
+    "return": ("return", 1, 2),
     "steps_to_goal": ("steps to the goal", 1, 1),
     "steps_over_optimum": ("  over the kinematic optimum", 1, 3),
     "steps": ("steps of all trials", 1, 1),
@@ -228,7 +229,7 @@ def table(rows: dict[str, Estimate]) -> Table:
     for column in view.columns[1:]:
         column.justify = "right"
     for name, (text, factor, digits) in PRINTED.items():
-        if name not in rows or (name == "steps" and rows["success"].value == 1):
+        if name not in rows or (name == "steps" and rows.get("success", NONE).value == 1):
             continue
         value, low, high = (f"{factor * v:.{digits}f}" for v in dataclasses.astuple(rows[name]))
         interval = "-" if "nan" in (low, high) else f"{low} .. {high}"
@@ -243,12 +244,26 @@ def plain(row: Estimate) -> dict[str, float | None]:
 
 def write_video(path: Path, config: Config, agent: Learner, seed: int, explore: bool) -> None:
     """Film the first trial that `evaluate` plays with the same seed, 30 times as fast as it is."""
+    small = {"steps_per_frame": 5, "size": 360} if config.env == MAZE else {}
+    shape = small if path.suffix == ".gif" else {}
+    frames = film(config, agent, seed=seed, explore=explore, **shape)
+    first = next(frames)  # before there is a file: some machines cannot draw
     if path.suffix == ".gif":
-        path.write_bytes(gif(film(config, agent, seed, explore, steps_per_frame=5, size=360)))
+        path.write_bytes(gif(itertools.chain([first], frames)))
         return
     with imageio.get_writer(path, fps=30) as writer:
-        for frame in film(config, agent, seed, explore):
+        for frame in itertools.chain([first], frames):
             writer.append_data(frame)
+
+
+def optimum(config: Config) -> float | None:
+    """Steps of the best noise-free run through the maze; None for other tasks."""
+    if config.env != MAZE:
+        return None
+    env = make_env(config)
+    steps = optimal_steps(env.unwrapped.plan, config.maze.hold).steps
+    env.close()
+    return steps
 
 
 @arithmetic()
@@ -269,9 +284,7 @@ def run(options: Options) -> dict[str, Estimate]:
         options.seed,
         "human" if options.viewer else None,
     )
-    env = make_env(config)
-    rows = summarise(records, optimal_steps(env.unwrapped.plan, config.maze.hold).steps)
-    env.close()
+    rows = summarise(records, optimum(config))
     print(learned(agent, path, state))
     print(f"{plural(options.episodes, 'trial')} with {policy} actions:")
     Console().print(table(rows))
@@ -284,7 +297,7 @@ def run(options: Options) -> dict[str, Estimate]:
             "seed": options.seed,
             "confidence": CONFIDENCE,
             "results": {name: plain(row) for name, row in rows.items()},
-            "trials": [dataclasses.asdict(record) for record in records],
+            "trials": [record.row() for record in records],
             "config": dataclasses.asdict(config),
             "versions": versions(),
         }

@@ -13,6 +13,7 @@ import io
 import itertools
 import json
 import os
+import re
 import shutil
 import tempfile
 from collections.abc import Sequence
@@ -313,8 +314,9 @@ def flatten(settings: dict[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def default_name(config: Config) -> str:
-    """Name of a run directory, e.g. sga-sofnn-estimated-s0."""
-    return f"{config.learner.name}-{config.network}-{config.pose}-s{config.seed}"
+    """Name of a run directory, e.g. sga-sofnn-estimated-s0, or sga-sofnn-MountainCar-v0-s0."""
+    task = config.pose if config.env == "maze" else re.sub(r"[^\w.-]+", "-", config.env)
+    return f"{config.learner.name}-{config.network}-{task}-s{config.seed}"
 
 
 def first_free(path: Path) -> Path:
