@@ -140,7 +140,7 @@ def test_the_last_trial_is_played_again_to_the_bit(tmp_path):
     training.train(work.config, training.RunOptions(tmp_path, "run", quiet=True))
     record, path = running.last_trial(work.path)
     assert record.steps == read_column(work.path / "trials.csv", "steps")[-1]
-    assert record.pose_error == read_column(work.path / "trials.csv", "pose_error")[-1]
+    assert record.measures["pose_error"] == read_column(work.path / "trials.csv", "pose_error")[-1]
     assert len(path.true) == record.decisions + 1
 
 

@@ -173,9 +173,9 @@ class Monitor:
         gc.collect()  # figures refer to themselves: 200 MiB would wait for the next full collection
 
     def _video(self, trial: int, agent: Learner) -> None:
-        frames = film(self.config, agent, steps_per_frame=10, limit=VIDEO_STEPS, size=240)
-        if self.config.env != MAZE:  # their pictures have a size of their own
-            frames = film(self.config, agent, limit=VIDEO_STEPS)
+        # Other tasks draw as they like, one picture for each step.
+        shape = {"steps_per_frame": 10, "size": 240} if self.config.env == MAZE else {}
+        frames = film(self.config, agent, limit=VIDEO_STEPS, **shape)
         self._image("video/evaluation", gif(frames), trial)
 
     def _image(self, name: str, data: bytes, trial: int) -> None:

@@ -31,8 +31,16 @@ def task_tables(agent: str, network: str, inputs: int) -> dict[str, Any]:
     net = NetworkConfig(
         theta=0.3 if agent == "q" else 0.4, width=(float(f"{width:.3g}"),), grid=(along,)
     )
-    sga = SGAConfig(initial_value=1.0, sigma_initial=0.5, replays=20)
-    q = QConfig(temperature=0.005, rate_action=0.3, initial=1.0, value_limit=1.0, replays=20)
+    # A rule that fires alone for a whole trial is stable if rate_value < 2 (1 - gamma lambda).
+    sga = SGAConfig(
+        rate_value=0.3,
+        rate_deviation=1.0,
+        sigma_initial=1.0,
+        sigma_min=0.3,
+        initial_value=1.0,
+        replays=20,
+    )
+    q = QConfig(temperature=0.005, trace_decay=0.9, initial=1.0, value_limit=1.0, replays=20)
     return {"net": net, "sga": sga, "q": q, "maze": MazeConfig()}
 
 

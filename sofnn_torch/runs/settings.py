@@ -196,26 +196,22 @@ class Config(Settings):
         """Raise ValueError on settings that exclude each other."""
         if self.env != MAZE:
             self._check_axes()
-        settings, reward = self.learner_settings, self.maze.goal_reward
+        settings = self.learner_settings
+        reward = self.maze.goal_reward if self.env == MAZE else -math.inf
         if self.own and "own" in self.idle():
             raise ValueError(f"--own is for a learner of one's own, not for --agent {self.agent}")
-        if self.env != MAZE:
-            reward = -math.inf
         limit = None if "value_limit" in settings.idle() else getattr(settings, "value_limit", None)
         if limit is not None and limit < reward:
             raise ValueError(
                 f"{flag(settings.table, 'value_limit')} {limit:g} must be at least "
                 f"--maze.goal-reward {reward:g}, or None"
             )
-        inputs = len(self.task.axes)
-        _each(self.net.width, inputs, "--net.width")
-        _each(self.net.grid, inputs, "--net.grid")
-        if self.network == "fixed":
-            shape = self.grid
-            if math.prod(shape) > self.net.max_rules:
-                raise ValueError(
-                    f"--net.grid {shape} has more rules than --net.max-rules {self.net.max_rules}"
-                )
+        _each(self.net.width, len(self.task.axes), "--net.width")
+        shape = self.grid  # also checks that the learner can do the task
+        if self.network == "fixed" and math.prod(shape) > self.net.max_rules:
+            raise ValueError(
+                f"--net.grid {shape} has more rules than --net.max-rules {self.net.max_rules}"
+            )
 
 
 def _each(values: tuple[Any, ...], count: int, name: str) -> tuple[Any, ...]:
