@@ -119,8 +119,11 @@ class _Parser(argparse.ArgumentParser):
 def _preset(known: argparse.Namespace) -> Config:
     try:
         given = {name: getattr(known, name) for name in BASIC}
-        return Config(**given | {"seed": int(known.seed)})
+        seed = str(known.seed)
+        return Config(**given | {"seed": int(seed) if seed.isdecimal() else 0})
     except ValueError:
+        if known.env != Config.env:  # the flags below are those of another task
+            raise
         return Config()  # no such preset: all flags are checked next
 
 

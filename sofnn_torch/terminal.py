@@ -24,6 +24,7 @@ PLAIN = {
     r"Error parsing (\S+): .+ for int\(\) .+?: (.+)": r"\1 must be a whole number, got \2",
     r"Error parsing (\S+): .+ to float: (.+)": r"\1 must be a number, got \2",
     r"Error parsing (\S+): .+? \[(.+)\] into tuple .+\[(.+)\]": r"\1 must be \3, got \2",
+    r"Error parsing (\S+): Could not find valid parse .+?: (\[.*\])": r"\1 cannot be \2",
     r"Error parsing \w+: (--.+)": r"\1",  # said by a check of the settings
 }
 

@@ -114,7 +114,7 @@ def test_a_run_is_trained_and_evaluated_and_then_kept(tmp_path, monkeypatch):
     assert len(data["greedy"]) == len(data["sampled"]) == running.EPISODES
     config, agent, _, _ = evaluate.load(work.path)
     again = evaluate.evaluate(config, agent, running.EPISODES, True, data["seed"])
-    assert data["sampled"] == [dataclasses.asdict(record) for record in again]
+    assert data["sampled"] == [record.row() for record in again]
     monkeypatch.setattr(training, "train", None)
     monkeypatch.setattr(training, "resume", None)
     assert done(work) == 0

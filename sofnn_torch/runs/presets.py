@@ -27,7 +27,8 @@ def task_tables(agent: str, network: str, inputs: int) -> dict[str, Any]:
     beyond two inputs. A grid has about a thousand rules and widths of half its spacing.
     """
     along = max(2, int(1000 ** (1 / inputs) + 1e-9))
-    width = 0.1 * max(1.0, math.sqrt(inputs / 2)) if network == "sofnn" else 0.5 / along
+    sharpness = 0.07 if agent == "q" else 0.1  # greedy action values need sharper sets
+    width = sharpness * max(1.0, math.sqrt(inputs / 2)) if network == "sofnn" else 0.5 / along
     net = NetworkConfig(
         theta=0.3 if agent == "q" else 0.4, width=(float(f"{width:.3g}"),), grid=(along,)
     )
@@ -40,7 +41,7 @@ def task_tables(agent: str, network: str, inputs: int) -> dict[str, Any]:
         initial_value=1.0,
         replays=20,
     )
-    q = QConfig(temperature=0.005, trace_decay=0.9, initial=1.0, value_limit=1.0, replays=20)
+    q = QConfig(temperature=0.002, trace_decay=0.9, initial=1.0, value_limit=1.0)
     return {"net": net, "sga": sga, "q": q, "maze": MazeConfig()}
 
 
