@@ -14,7 +14,10 @@ from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Tu
 from sofnn_torch import evaluate, training
 from sofnn_torch.cli import main
 from sofnn_torch.network.axes import Axis
+from sofnn_torch.pictures.figures import read_column
+from sofnn_torch.pictures.film import film
 from sofnn_torch.rules import words
+from sofnn_torch.rules.__main__ import main as rules_main
 from sofnn_torch.runs.session import build
 from sofnn_torch.runs.settings import Config, from_dict
 from sofnn_torch.tasks import survey
@@ -293,6 +296,33 @@ def test_a_run_trains_resumes_exactly_and_says_its_rules(env, agent, network, tm
     assert sentence.startswith(f"IF {config.task.axes[0].name} is about ")
 
 
+def test_the_film_shows_the_trial_that_evaluation_plays(toy, monkeypatch):
+    config = short(toy(steps=7))
+    agent, env = build(config)
+    training.play(env, agent)
+    monkeypatch.setattr(Toy, "render", lambda self: len(self.taken), raising=False)
+    before = agent.rng.bit_generator.state
+    assert list(film(config, agent, seed=4)) == list(range(8))
+    assert list(film(config, agent, seed=4, limit=3)) == list(range(4))
+    assert agent.rng.bit_generator.state == before
+
+
+def test_a_state_is_given_in_the_units_of_the_task(tmp_path, capsys, monkeypatch):
+    run = str(training.train(short("MountainCar-v0"), quick_options(tmp_path)))
+
+    def call(*numbers):
+        monkeypatch.setattr("sys.argv", ["rules", run, "--at", *numbers])
+        try:
+            rules_main()
+        except SystemExit as stop:
+            assert stop.code == 2
+        return capsys.readouterr()
+
+    assert "at position -0.50, velocity 0.010:" in call("-0.5", "0.01").out
+    assert "velocity 3 is out of its range, -0.07 to 0.07" in call("-0.5", "3").err
+    assert "--at needs 2 numbers (position, velocity), got 3" in call("0", "0", "0").err
+
+
 def test_a_task_that_knows_success_is_judged_by_it(toy, tmp_path):
     run = training.train(short(toy(success=True)), quick_options(tmp_path))
     header, line, _ = (run / "trials.csv").read_text().splitlines()
@@ -306,3 +336,19 @@ def test_learners_see_scaled_rewards_and_records_the_real_ones(toy):
     record, _ = training.play(env, agent)
     assert record.reward == -12
     assert agent.memory.rows[:3, -4].tolist() == [-2.0] * 3  # reward, continues, two inputs
+
+
+# ------------------------------------------------------------------------------------- learning
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("agent", ["sga", "q"])
+@pytest.mark.parametrize(
+    ("env", "trials", "random"), [("MountainCar-v0", 100, -200), ("CartPole-v1", 100, 22)]
+)
+@pytest.mark.parametrize("seed", range(3))
+def test_the_defaults_learn(agent, env, trials, random, seed, tmp_path):
+    config = Config(env=env, agent=agent, seed=seed, trials=trials)
+    run = training.train(config, quick_options(tmp_path))
+    learned = read_column(run / "trials.csv", "reward")[-20:].mean()
+    assert learned > random + 20
