@@ -38,6 +38,8 @@ Examples:
 Ctrl-C saves. Watch with: tensorboard --logdir runs
 """
 
+BASIC = ("env", "agent", "network", "preset", "seed")  # all other settings depend on them
+
 
 @dataclass(frozen=True)
 class Flags(Settings):
@@ -106,8 +108,8 @@ def parse(argv: Sequence[str]) -> Flags:
         SystemExit: with code 0 after printing the help.
     """
     first = _Parser(add_help=False, allow_abbrev=False)
-    for name, value in (("agent", "sga"), ("network", "sofnn"), ("preset", "default")):
-        first.add_argument(f"--{name}", default=value)
+    for name in BASIC:
+        first.add_argument(f"--{name}", default=getattr(Config, name))
     first.add_argument("--resume", type=Path)
     known, _ = first.parse_known_args(argv)
     if known.resume and not {"-h", "--help"} & set(argv):
@@ -119,7 +121,7 @@ def parse(argv: Sequence[str]) -> Flags:
     if flags.resume:
         _keep_settings(flags, base)
     _refuse_idle(flags, unchanged)
-    if flags.seeds is not None and flags.config.seed != base.seed:
+    if flags.seeds is not None and flags.config.seed != Config.seed:
         raise ValueError("--seed and --seeds exclude each other")
     return flags
 
@@ -131,8 +133,12 @@ class _Parser(argparse.ArgumentParser):
 
 def _preset(known: argparse.Namespace) -> Config:
     try:
-        return Config(agent=known.agent, network=known.network, preset=known.preset)
+        given = {name: getattr(known, name) for name in BASIC}
+        seed = str(known.seed)
+        return Config(**given | {"seed": int(seed) if seed.isdecimal() else 0})
     except ValueError:
+        if known.env != Config.env:  # the flags below are those of another task
+            raise
         return Config()  # no such preset: all flags are checked next
 
 

@@ -40,7 +40,7 @@ from sofnn_torch.runs.directory import same_settings
 from sofnn_torch.runs.factory import make_agent, make_env
 from sofnn_torch.runs.provenance import versions
 from sofnn_torch.runs.session import arithmetic, saved_config
-from sofnn_torch.runs.settings import Config
+from sofnn_torch.runs.settings import MAZE, Config
 from sofnn_torch.runs.trial import TrialRecord
 from sofnn_torch.terminal import command, plural, say
 from sofnn_torch.training import play
@@ -205,25 +205,25 @@ def summarise(records: Sequence[TrialRecord], optimum: float | None = None) -> d
         records: the trials.
         optimum: steps of the best noise-free run through the maze, if known.
     """
+    measured = [r.measures for r in records]
+    rows = {name: mean([m[name] for m in measured]) for name in measured[0] if name in PRINTED}
+    rows |= {"return": mean([r.reward for r in records]), "steps": mean([r.steps for r in records])}
+    if records[0].success is None:
+        return rows
     arrived = [r.steps for r in records if r.success]
-    rows = {
-        "success": proportion(len(arrived), len(records)),
-        "steps": mean([r.steps for r in records]),
-        "steps_to_goal": mean(arrived),
-        "collisions": mean([r.collisions for r in records]),
-        "pose_error": mean([r.pose_error for r in records]),
-        "pose_error_max": mean([r.pose_error_max for r in records]),
-        "heading_error": mean([r.heading_error for r in records]),
-    }
+    rows |= {"success": proportion(len(arrived), len(records)), "steps_to_goal": mean(arrived)}
     if optimum:
         scaled = (value / optimum for value in dataclasses.astuple(rows["steps_to_goal"]))
         rows["steps_over_optimum"] = Estimate(*scaled)
     return rows
 
 
+NONE = Estimate(math.nan, math.nan, math.nan)
+
 # Name in the results -> text, factor to the printed unit, decimals.
 PRINTED: dict[str, tuple[str, float, int]] = {
     "success": ("trials that reached the goal, %", 100, 1),
+    "return": ("return", 1, 2),
     "steps_to_goal": ("steps to the goal", 1, 1),
     "steps_over_optimum": ("  over the kinematic optimum", 1, 3),
     "steps": ("steps of all trials", 1, 1),
@@ -240,7 +240,7 @@ def table(rows: dict[str, Estimate]) -> Table:
     for column in view.columns[1:]:
         column.justify = "right"
     for name, (text, factor, digits) in PRINTED.items():
-        if name not in rows or (name == "steps" and rows["success"].value == 1):
+        if name not in rows or (name == "steps" and rows.get("success", NONE).value == 1):
             continue
         value, low, high = (f"{factor * v:.{digits}f}" for v in dataclasses.astuple(rows[name]))
         interval = "-" if "nan" in (low, high) else f"{low} .. {high}"
@@ -259,11 +259,20 @@ def write_video(path: Path, config: Config, agent: Learner, seed: int, explore: 
     Raises:
         OSError: the film cannot be made or written.
     """
-    if path.suffix == ".gif":
-        data = gif(film(config, agent, seed, explore, steps_per_frame=5, size=360))
-    else:
-        data = mp4(film(config, agent, seed, explore))
-    checkpoint.write_atomically(path, data)
+    small = {"steps_per_frame": 5, "size": 360} if config.env == MAZE else {}
+    gifs = path.suffix == ".gif"
+    frames = film(config, agent, seed=seed, explore=explore, **(small if gifs else {}))
+    checkpoint.write_atomically(path, gif(frames) if gifs else mp4(frames))
+
+
+def optimum(config: Config) -> float | None:
+    """Steps of the best noise-free run through the maze; None for other tasks."""
+    if config.env != MAZE:
+        return None
+    env = make_env(config)
+    steps = optimal_steps(env.unwrapped.plan, config.maze.hold).steps
+    env.close()
+    return steps
 
 
 @arithmetic()
@@ -285,9 +294,7 @@ def run(options: Options) -> dict[str, Estimate]:
         "human" if options.viewer else None,
         quiet=False,
     )
-    env = make_env(config)
-    rows = summarise(records, optimal_steps(env.unwrapped.plan, config.maze.hold).steps)
-    env.close()
+    rows = summarise(records, optimum(config))
     print(learned(agent, path, state))
     print(f"{plural(options.episodes, 'trial')} with {policy} actions:")
     Console().print(table(rows))
@@ -300,7 +307,7 @@ def run(options: Options) -> dict[str, Estimate]:
             "seed": options.seed,
             "confidence": CONFIDENCE,
             "results": {name: plain(row) for name, row in rows.items()},
-            "trials": [dataclasses.asdict(record) for record in records],
+            "trials": [record.row() for record in records],
             "config": dataclasses.asdict(config),
             "versions": versions(),
         }

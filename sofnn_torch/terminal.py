@@ -37,6 +37,7 @@ PLAIN = {
     r"Error parsing (\S+): (must be .+)": r"\1 \2",
     r"Error parsing (\S+): Could not find valid parse .+?: (.+)": r"\1 cannot be \2",
     r"Error parsing (\S+): .+? \[(.+)\] into tuple .+\[(.+)\]": r"\1 must be \3, got \2",
+    r"Error parsing (\S+): Could not find valid parse .+?: (\[.*\])": r"\1 cannot be \2",
     r"Error parsing \w+: (--.+)": r"\1",  # said by a check of the settings
 }
 

@@ -52,7 +52,7 @@ def play(
     """
     policy = agent if learn else FrozenPolicy(agent, explore)
     observation, info = env.reset()
-    recorder = Recorder(info)
+    recorder = Recorder(env, observation, info)
     with Watch(agent, env, observation) as watch:
         action = policy.start(observation)
         while action is not None:
@@ -61,9 +61,9 @@ def play(
             observation, reward, terminated, truncated, info = env.step(action)
             watch.observation = observation
             action = policy.step(reward, observation, terminated, truncated)
-            recorder.add(reward, info)
+            recorder.add(reward, observation, info)
             watch.check(reward)
-    return recorder.finish(env, agent, agent.statistics() if learn else {})
+    return recorder.finish(agent, agent.statistics() if learn else {})
 
 
 def train(config: Config, options: RunOptions | None = None) -> Path:
@@ -139,7 +139,7 @@ def _loop(session: Session, options: RunOptions, trap: SignalTrap) -> Path:
                 total_steps=session.state["total_steps"] + record.steps,
             )
             is_best = session.advance(record)
-            run.record(_row(record))
+            run.record(record.row())
             monitor.trial(record, path, agent, speed)
             if is_best:
                 run.save_as("best.pt", session.state)
@@ -171,15 +171,12 @@ def _loop(session: Session, options: RunOptions, trap: SignalTrap) -> Path:
     return run.path
 
 
-def _row(record: TrialRecord) -> dict[str, Any]:
-    """A line of trials.csv: the fields of the record, the statistics last."""
-    row = dataclasses.asdict(record)
-    return row | row.pop("statistics")
-
-
 def _summary(record: TrialRecord, state: dict[str, Any], speed: float) -> list[str]:
     """What the progress shows, the most important first."""
     outcome = f"{record.steps} steps" if record.success else "no goal"
-    recent = [success for success, _ in state["recent"]]
+    recent = [outcome for outcome, _ in state["recent"]]
     share = f"goal in {sum(recent)} of {len(recent)}"
+    if record.success is None:
+        outcome = f"return {record.reward:,.4g}"
+        share = f"{sum(recent) / len(recent):,.4g} in the last {len(recent)}"
     return [f"{speed:,.0f} steps/s", share, outcome, plural(record.rules, "rule")]

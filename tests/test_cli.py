@@ -249,7 +249,7 @@ def test_growth_without_end_stops_at_the_limit_and_says_so(agent, here, capsys):
         ("--net.max-rules 0", "--net.max-rules must be positive"),
         ("--net.theta x", "--net.theta must be a number, got 'x'"),
         ("--net.grid 4 4", "--net.grid needs 3 values"),
-        ("--net.grid 4 4 x", "--net.grid must be int, int, int, got '4', '4', 'x'"),
+        ("--net.grid 4 4 x", "--net.grid cannot be ['4', '4', 'x']"),
         ("--agent q --q.trace-limit x", "--q.trace-limit must be FLOAT or None, got ['x']"),
         ("--network fixed --net.grid 999 999 999", "--net.max-rules"),
         ("--sga.gamma 1.5", "--sga.gamma must lie in"),

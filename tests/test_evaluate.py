@@ -22,7 +22,8 @@ from sofnn_torch.runs.settings import Config
 from sofnn_torch.runs.trial import TrialRecord
 from sofnn_torch.training import RunOptions, train
 
-RECORD = TrialRecord(1, 500, 60, 500, 1.0, True, 1, 2, 100, 0.003, 0.01, 0.02)
+MEASURES = {"collisions": 1, "subgoals": 2, "pose_error": 0.003, "pose_error_max": 0.01}
+RECORD = TrialRecord(1, 500, 60, 500, 1.0, True, 100, MEASURES)
 
 
 @pytest.fixture(scope="module")

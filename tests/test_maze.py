@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from sofnn_torch.maze.env import LEFT, RIGHT, STRAIGHT, KheperaMazeEnv
-from sofnn_torch.maze.odometry import FORWARD_SPEED
+from sofnn_torch.maze.odometry import FORWARD_SPEED, pose_errors
 from sofnn_torch.maze.robot import default_model_path
 from sofnn_torch.runs.factory import make_env
 from sofnn_torch.runs.settings import Config
@@ -409,14 +409,14 @@ def test_the_ranges_are_those_of_the_plan(tmp_path):
 def test_errors_are_measured_over_decisions_and_headings_the_short_way_round():
     true = np.array([[0.0, 0.0, 0.0], [1.0, 1.0, 3.1], [2.0, 1.0, 0.5]])
     estimated = np.array([[0.0, 0.0, 0.0], [1.0, 1.5, -3.1], [2.3, 1.4, 0.25]])
-    errors = KheperaMazeEnv().measure(true, estimated)
+    errors = pose_errors(true, estimated)
     turn = 2 * math.pi - 6.2
     assert errors == pytest.approx(
         {"pose_error": 0.5, "pose_error_max": 0.5, "heading_error": (turn + 0.25) / 2}
     )
     worse = np.array([*estimated[:2], [2.0, 1.1, 0.5]])
-    assert KheperaMazeEnv().measure(true, worse)["pose_error_max"] == 0.5
-    assert KheperaMazeEnv().measure(true, worse)["pose_error"] == pytest.approx(0.3)
+    assert pose_errors(true, worse)["pose_error_max"] == 0.5
+    assert pose_errors(true, worse)["pose_error"] == pytest.approx(0.3)
 
 
 def test_the_default_maze_is_the_one_that_training_uses():

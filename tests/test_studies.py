@@ -114,7 +114,7 @@ def test_a_run_is_trained_and_evaluated_and_then_kept(tmp_path, monkeypatch):
     assert len(data["greedy"]) == len(data["sampled"]) == running.EPISODES
     config, agent, _, _ = evaluate.load(work.path)
     again = evaluate.evaluate(config, agent, running.EPISODES, True, data["seed"])
-    assert data["sampled"] == [dataclasses.asdict(record) for record in again]
+    assert data["sampled"] == [record.row() for record in again]
     monkeypatch.setattr(training, "train", None)
     monkeypatch.setattr(training, "resume", None)
     assert done(work) == 0
@@ -140,7 +140,7 @@ def test_the_last_trial_is_played_again_to_the_bit(tmp_path):
     training.train(work.config, training.RunOptions(tmp_path, "run", quiet=True))
     record, path = running.last_trial(work.path)
     assert record.steps == read_column(work.path / "trials.csv", "steps")[-1]
-    assert record.pose_error == read_column(work.path / "trials.csv", "pose_error")[-1]
+    assert record.measures["pose_error"] == read_column(work.path / "trials.csv", "pose_error")[-1]
     assert len(path.true) == record.decisions + 1
 
 

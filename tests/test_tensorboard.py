@@ -84,7 +84,7 @@ def test_every_scalar_is_documented_and_has_its_value(tmp_path, played):
     assert scalar(found, "trial/steps") == {1: record.steps}
     assert scalar(found, "rules/count") == {1: record.rules}
     assert scalar(found, "speed/steps_per_second") == {1: 1234.5}
-    assert scalar(found, "pose/error_mean")[1] == pytest.approx(record.pose_error)
+    assert scalar(found, "pose/error_mean")[1] == pytest.approx(record.measures["pose_error"])
     for name, value in record.statistics.items():
         assert scalar(found, name)[1] == pytest.approx(value)
 

@@ -7,7 +7,6 @@ from numpy.typing import NDArray
 
 from sofnn_torch.learners.learner import Action, Learner
 
-PATIENCE = 4  # decisions at a rule that a sound way may need: a turn, a coarse grid
 MOST = 10  # doublings: by then every action is about as likely
 
 
@@ -17,9 +16,10 @@ class FrozenPolicy:
     While a robot learns, values that lead it in a circle or against a wall are soon corrected.
     Frozen values are not, and a policy without chance would go on for ever. But to decide again and
     again where the same rule fires most says that they are wrong by more than the present chance
-    covers: with each such decision after the fourth the learned standard deviation (eq. 5), or
-    temperature (eq. 11), is added 1, 3, 7, ... times at that rule until the end of the trial. A
-    policy that goes straight to the goal leaves a rule sooner and is not changed by this.
+    covers: with each such decision after the fourth (`Task.patience`) the learned standard
+    deviation (eq. 5), or temperature (eq. 11), is added 1, 3, 7, ... times at that rule until the
+    end of the trial. A policy that goes straight to the goal leaves a rule sooner and is not
+    changed by this. In tasks other than the maze patience is endless: there is no such cure.
 
     Args:
         agent: the learner; only its random generator moves.
@@ -44,5 +44,5 @@ class FrozenPolicy:
         """The action at an observation (n,)."""
         rule = self.agent.strongest_rule(observation)
         self.visits[rule] += 1
-        doublings = min(max(self.visits[rule] - PATIENCE, 0), MOST)
+        doublings = min(max(self.visits[rule] - self.agent.task.patience, 0), MOST)
         return self.agent.act(observation, self.explore + 2**doublings - 1)

@@ -38,12 +38,17 @@ class Task:
         discrete: choose one of the actions; otherwise each is a number in [-1, 1].
         wheels: wheel speeds of a scalar action of a robot, over the fastest (for the coding
             ``wheels`` of Q-learning).
+        reward_scale: factor of each reward before it is learned from; values are in its unit.
+        patience: decisions at one rule after which a policy that does not learn is taken to run in
+            a circle; inf for never.
     """
 
     axes: tuple[Axis, ...]
     actions: tuple[str, ...]
     discrete: bool
     wheels: Callable[[float], list[float]] | None = None
+    reward_scale: float = 1.0
+    patience: float = 4
 
 
 @dataclass(frozen=True)
@@ -155,6 +160,7 @@ class Learner(ABC):
             terminated: no state follows this one; its value is 0.
             truncated: the trial ends here, but not the robot's way: the value of the state counts.
         """
+        reward = reward * self.task.reward_scale
         if self.memory is not None:
             self.memory.add([*self.decision, reward, not terminated, *observation.tolist()])
         if terminated:

@@ -1,7 +1,7 @@
 """The Khepera in its maze as a Gymnasium environment: decisions, rewards, pose estimates."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -264,9 +264,18 @@ class KheperaMazeEnv(gymnasium.Env[np.ndarray, Any]):
         """What the actions are called: one name for each choice, or for each number."""
         return ACTION_NAMES[self.actions]
 
-    def measure(self, true: np.ndarray, estimated: np.ndarray) -> dict[str, float]:
-        """Return how far a trial's pose estimates were from the truth, see `pose_errors`."""
-        return pose_errors(true, estimated)
+    def measure(self, infos: Sequence[dict[str, Any]]) -> dict[str, float]:
+        """Return what a trial was like, from the info at its start and of each decision.
+
+        `collisions`, decisions that ended in a bump, `subgoals` that were found, and how far the
+        pose estimates were from the truth, see `pose_errors`.
+        """
+        poses = (np.array([info[n] for info in infos]) for n in ("true_pose", "estimated_pose"))
+        return {
+            "collisions": sum(int(info["collision"]) for info in infos[1:]),
+            "subgoals": sum(map(bool, infos[-1]["subgoals"])),
+            **pose_errors(*poses),
+        }
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what a copy or a pickle takes along: all but the renderer and the callback.

@@ -1,4 +1,4 @@
-"""Settings of the network for the robot's pose."""
+"""Settings of the network."""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -24,13 +24,17 @@ class NetworkConfig(Settings, table="net"):
     """Width v of new membership functions on x and y, in metres."""
     width_heading: Positive = 0.45
     """Width v of new membership functions on the heading, in radians."""
+    width: Annotated[tuple[float, ...], Within(above=0)] = (0.1,)
+    """Width v of new membership functions as a share of the range of each input, or one for all
+    inputs; in tasks other than the maze."""
     width_action: Positive = 0.3
     """Width v on the action, where the action is an antecedent (`--q.coding antecedent`)."""
     interpolate: bool = False
     """A new rule takes over the policy that the network had there (SGA), or the action values
     (Q-learning), instead of the initial ones."""
-    grid: Annotated[tuple[int, int, int], Within(above=0)] = (12, 12, 8)
-    """Rules along x, y and heading of the fixed network (12 12 8 and 24 24 16 in the paper)."""
+    grid: Annotated[tuple[int, ...], Within(above=0)] = (12, 12, 8)
+    """Rules along each input of the fixed network, or one number for all inputs; along x, y and
+    heading in the maze (12 12 8 and 24 24 16 in the paper)."""
     grid_action: Rules = 8
     """Rules along the action of the fixed network, where the action is an antecedent."""
     max_rules: Annotated[Rules, Within(most=10_000_000), tyro.conf.arg(aliases=["--max-rules"])] = (

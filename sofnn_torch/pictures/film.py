@@ -7,6 +7,7 @@ import subprocess
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import imageio_ffmpeg
 import mujoco
@@ -20,10 +21,47 @@ from sofnn_torch.maze.rendering import OffscreenRenderer
 from sofnn_torch.maze.robot import load_model
 from sofnn_torch.runs import seeding
 from sofnn_torch.runs.factory import make_env
-from sofnn_torch.runs.settings import Config
+from sofnn_torch.runs.settings import MAZE, Config
 
 
-def film(
+def film(config: Config, agent: Learner, **options: Any) -> Iterator[NDArray[np.uint8]]:
+    """Frames of one trial without learning.
+
+    Args:
+        config: settings of the run.
+        agent: the learner; only its random generator moves, and is set back.
+        **options: ``seed``, ``explore`` and ``limit``, and in the maze also ``steps_per_frame`` and
+            ``size``, see `maze_film`.
+
+    Raises:
+        ValueError: the task cannot be drawn here.
+        RenderingError: this machine cannot draw the maze.
+    """
+    return (maze_film if config.env == MAZE else task_film)(config, agent, **options)
+
+
+def task_film(
+    config: Config, agent: Learner, seed: int = 0, explore: bool = False, limit: int = 20_000
+) -> Iterator[NDArray[np.uint8]]:
+    """Frames as the environment draws them, one for each step."""
+    env = make_env(config, "rgb_array")
+    rng = agent.rng  # a film must not change the training
+    agent.reseed(seed)
+    try:
+        env.reset(seed=seed)
+        observation, _ = env.reset()  # as in a series of trials, where only the first is seeded
+        policy, over = FrozenPolicy(agent, explore), False
+        yield env.render()
+        while not over and env.steps < limit:
+            observation, _, terminated, truncated, _ = env.step(policy.act(observation))
+            over = terminated or truncated
+            yield env.render()
+    finally:
+        agent.rng = rng
+        env.close()
+
+
+def maze_film(
     config: Config,
     agent: Learner,
     seed: int = 0,
@@ -32,7 +70,7 @@ def film(
     limit: int = 20_000,
     size: int = 480,
 ) -> Iterator[NDArray[np.uint8]]:
-    """Frames (size, size, 3) of one trial without learning.
+    """Frames (size, size, 3) of a trial in the maze.
 
     Args:
         config: settings of the run.

@@ -25,13 +25,18 @@ from sofnn_torch.pictures.events import EventFile
 from sofnn_torch.pictures.film import film, gif
 from sofnn_torch.runs.directory import flatten
 from sofnn_torch.runs.factory import make_env
-from sofnn_torch.runs.settings import Config
+from sofnn_torch.runs.settings import MAZE, Config
 from sofnn_torch.runs.trial import Trajectory, TrialRecord
 from sofnn_torch.terminal import say
 
 WINDOW = 10  # trials in the moving success rate
 VIDEO_STEPS = 1000  # a robot that does not find the goal is not filmed for ever
 HPARAM_METRICS = ("trial/steps", "trial/success_last_10", "trial/return", "rules/count")
+TAGS = {
+    "pose_error": "pose/error_mean",
+    "pose_error_max": "pose/error_max",
+    "heading_error": "pose/heading_error_mean",
+}
 
 
 class Monitor:
@@ -74,9 +79,10 @@ class Monitor:
             agent: the learner after the trial.
             steps_per_second: simulator steps over wall-clock time of the trial.
         """
-        self.successes.append(record.success)
+        if record.success is not None:
+            self.successes.append(record.success)
         self._guard("TensorBoard", lambda: self._scalars(record, steps_per_second))
-        if self._due(record.trial, self.picture_every):
+        if self.config.env == MAZE and self._due(record.trial, self.picture_every):
             self._guard("pictures", lambda: self._pictures(record.trial, path, agent))
         if self._due(record.trial, self.video_every):
             self._guard("video", lambda: self._video(record.trial, agent))
@@ -132,17 +138,14 @@ class Monitor:
             "trial/steps": record.steps,
             "trial/decisions": record.decisions,
             "trial/return": record.reward,
-            "trial/success": float(record.success),
-            "trial/success_last_10": sum(self.successes) / len(self.successes),
-            "trial/collisions": record.collisions,
-            "trial/subgoals": record.subgoals,
             "trial/total_steps": record.total_steps,
             "rules/count": record.rules,
-            "pose/error_mean": record.pose_error,
-            "pose/error_max": record.pose_error_max,
-            "pose/heading_error_mean": record.heading_error,
             "speed/steps_per_second": steps_per_second,
         }
+        if record.success is not None:
+            values["trial/success"] = float(record.success)
+            values["trial/success_last_10"] = sum(self.successes) / len(self.successes)
+        values |= {TAGS.get(k, f"trial/{k}"): v for k, v in record.measures.items()}
         scalars = [
             Summary.Value(tag=k, simple_value=v) for k, v in (values | record.statistics).items()
         ]
@@ -170,7 +173,9 @@ class Monitor:
         gc.collect()  # figures refer to themselves: 200 MiB would wait for the next full collection
 
     def _video(self, trial: int, agent: Learner) -> None:
-        frames = film(self.config, agent, steps_per_frame=10, limit=VIDEO_STEPS, size=240)
+        # Other tasks draw as they like, one picture for each step.
+        shape = {"steps_per_frame": 10, "size": 240} if self.config.env == MAZE else {}
+        frames = film(self.config, agent, limit=VIDEO_STEPS, **shape)
         self._image("video/evaluation", gif(frames), trial)
 
     def _image(self, name: str, data: bytes, trial: int) -> None:

@@ -39,7 +39,7 @@ from sofnn_torch.runs.directory import Run
 from sofnn_torch.runs.factory import make_env
 from sofnn_torch.runs.places import numbered
 from sofnn_torch.runs.session import RunOptions, arithmetic, home_of
-from sofnn_torch.runs.settings import Config
+from sofnn_torch.runs.settings import MAZE, Config
 from sofnn_torch.terminal import command, plural, say
 from sofnn_torch.training import play
 
@@ -57,8 +57,9 @@ class Options(Settings):
     """Directory of the run, or one of its checkpoint files."""
     top: Annotated[int, Within(least=0)] = 20
     """Rules in the table; 0 for all."""
-    at: tuple[float, float, float] | None = None
-    """Show which rules decide at a pose instead: x and y in metres, heading in degrees."""
+    at: tuple[float, ...] | None = None
+    """Show which rules decide at a state instead: in the maze x and y in metres and the heading in
+    degrees, in another task its inputs in their order and units."""
     json: Path | None = None
     """Write all rules to this .json file."""
     csv: Path | None = None
@@ -80,7 +81,7 @@ def check(options: Options) -> None:
         ValueError: naming the flag.
     """
     if options.at and not all(abs(value) < 1e6 for value in options.at):
-        raise ValueError(f"--at must be a pose in metres and degrees, got {options.at}")
+        raise ValueError(f"--at must be a state in the units of its inputs, got {options.at}")
     if options.name is not None and not options.load:
         raise ValueError("--name goes with --load")
     RunOptions(name=options.name)
@@ -107,6 +108,8 @@ def firing_along_a_trial(
     finally:
         env.close()
     outcome = f"{'goal' if record.success else 'no goal'} after {record.steps:,} steps"
+    if record.success is None:
+        outcome = f"return {record.reward:,.4g} in {record.steps:,} steps"
     return agent.usage(path.decided_at(config.pose)), record.decisions, outcome
 
 
@@ -137,10 +140,15 @@ def table(reading: Reading, shares: NDArray[Any], top: int) -> Table:
     return view
 
 
-def decision_table(reading: Reading, decision: Decision) -> Table:
-    """The rules that decide at a state, their shares, and what they conclude together."""
+def decision_table(reading: Reading, decision: Decision, by_action: bool) -> Table:
+    """The rules that decide at a state, their shares, and what they conclude together.
+
+    Args:
+        reading: all rules.
+        decision: at the state.
+        by_action: rules fire differently for each action.
+    """
     shares, worth = decision.shares, decision.shares * decision.conclusions
-    by_action = len(reading.antecedents) > 3
     columns = range(len(decision.names))
     if len(columns) > words.MANY:
         columns = [int(decision.outputs.argmax())]
@@ -184,13 +192,32 @@ def show(view: Table) -> None:
     (console if console.is_terminal else Console(width=WIDTH)).print(view)
 
 
-def warn_outside(config: Config, x: float, y: float) -> None:
-    """Say it if a position [m] is not in the maze: the rules answer everywhere."""
-    env = make_env(config)
-    width, height = env.unwrapped.plan.size
-    env.close()
-    if not (0 <= x <= width and 0 <= y <= height):
-        say(f"warning: --at {x:g} {y:g} is outside the maze of {width:g} x {height:g} m")
+def state_of(options: Options, config: Config) -> NDArray[np.float32]:
+    """The state (n,) that was asked for.
+
+    Where it is out of range this warns, and no more: the rules answer everywhere.
+
+    Raises:
+        ValueError: it has another number of inputs.
+    """
+    axes, values = config.task.axes, list(options.at or ())
+    if len(values) != len(axes):
+        names = ", ".join(axis.name for axis in axes)
+        raise ValueError(f"--at needs {len(axes)} numbers ({names}), got {len(values)}")
+    if config.env == MAZE:
+        env = make_env(config)
+        width, height = env.unwrapped.plan.size
+        env.close()
+        x, y, degrees = values
+        if not (0 <= x <= width and 0 <= y <= height):
+            say(f"warning: --at {x:g} {y:g} is outside the maze of {width:g} x {height:g} m")
+        values[2] = math.remainder(math.radians(degrees), 2 * math.pi)
+    else:
+        for axis, value in zip(axes, values, strict=True):
+            if not (axis.period or axis.low <= value <= axis.high):
+                ends = f"{axis.low:g} to {axis.high:g}"
+                say(f"warning: --at {axis.name} {value:g} is out of its range, {ends}")
+    return np.array(values, np.float32)
 
 
 def edit(
@@ -258,6 +285,8 @@ def run(options: Options) -> None:
     """
     check(options)
     config, agent, path, state = load(options.run)
+    if options.picture and config.env != MAZE:
+        raise ValueError(f"--picture is for the maze, not for --env {config.env}")
     if options.load:
         new, rules = edit(options, config, agent, path, state), agent.net.n_rules
         print(f"{new}: {plural(rules, 'rule')} from {options.load}, the rest from {path}")
@@ -265,12 +294,11 @@ def run(options: Options) -> None:
     print(learned(agent, path, state))
     reading = words.read(agent)
     if options.at:
-        x, y, degrees = options.at
-        warn_outside(config, x, y)
-        heading = math.remainder(math.radians(degrees), 2 * math.pi)
-        decision = words.decide(agent, np.array([x, y, heading], np.float32))
-        print(f"at x {1000 * x:.0f} mm, y {1000 * y:.0f} mm, heading {words.bearing(heading)}:")
-        show(decision_table(reading, decision))
+        state = state_of(options, config)
+        decision = words.decide(agent, state)
+        place = map(words.at, config.task.axes, state.tolist())
+        print(f"at {', '.join(place)}:")
+        show(decision_table(reading, decision, len(agent.inputs) > len(agent.task.axes)))
         print(f"action: {decision.action}")
         print(f"firing strength of the strongest rule: {decision.strongest:.2g}")
         return

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from sofnn_torch.learners.learner import Learner
 from sofnn_torch.rules import sheets
 from sofnn_torch.rules.sheets import show
-from sofnn_torch.runs.guard import FARTHEST, LARGEST, WIDEST
+from sofnn_torch.runs.guard import LARGEST, WIDEST, farthest
 
 FORMAT, VERSION = "sofnn-torch rules", 1
 SUFFIXES = (".json", ".csv")
@@ -77,7 +77,7 @@ def schema(agent: Learner) -> Schema:
     table = net.default_width.cpu().numpy()
     low, high = np.empty(2 * n + m, table.dtype), np.empty(2 * n + m, table.dtype)
     # Degrees in place of radians stand out.
-    high[:n] = [axis.period or FARTHEST for axis in agent.inputs]
+    high[:n] = [axis.period or farthest(axis) for axis in agent.inputs]
     high[n : 2 * n], high[2 * n :] = WIDEST * table, LARGEST
     high = np.nextafter(high, np.zeros_like(high))  # the guard refuses the limit itself
     low[:] = -high

@@ -152,7 +152,22 @@ def about(axis: Axis, centre: float, width: float) -> str:
         return bearing(centre, width)
     if axis.unit == "m":
         return f"{1000 * centre:.0f} ± {1000 * width:.0f}"
-    return f"{number(centre)} ± {width:.2f}"
+    digits = decimals(axis)
+    return f"{number(centre, digits)} ± {width:.{digits}f}"
+
+
+def decimals(axis: Axis) -> int:
+    """Decimals that tell a hundredth of the range of an axis, at least two."""
+    return max(2, 2 - math.floor(math.log10(axis.high - axis.low))) if axis.bounded else 2
+
+
+def at(axis: Axis, value: float) -> str:
+    """A number on an axis with its name and unit, as in ``x 150 mm``."""
+    if axis.unit == "rad" and axis.period:
+        return f"{axis.name} {bearing(value)}"
+    if axis.unit == "m":
+        return f"{axis.name} {1000 * value:.0f} mm"
+    return f"{axis.name} {number(value, decimals(axis))} {axis.unit}".rstrip()
 
 
 def bearing(heading: float, width: float | None = None) -> str:
@@ -162,6 +177,6 @@ def bearing(heading: float, width: float | None = None) -> str:
     return f"{degrees}{spread}° {WINDS[round(degrees / 45) % 8]}"
 
 
-def number(value: float) -> str:
-    """Two decimals, without a minus sign before zero."""
-    return f"{round(value, 2) + 0.0:.2f}" if abs(value) < 1e5 else f"{value:.3g}"
+def number(value: float, digits: int = 2) -> str:
+    """A few decimals, without a minus sign before zero."""
+    return f"{round(value, digits) + 0.0:.{digits}f}" if abs(value) < 1e5 else f"{value:.3g}"

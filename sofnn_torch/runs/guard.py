@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sofnn_torch.learners.learner import Learner
+from sofnn_torch.network.axes import Axis
 
-FARTHEST = 100.0  # metres, radians: no rule out there ever fires
+FARTHEST = 100.0  # in any unit; no rule so far outside the range of its input ever fires
 WIDEST = 50.0  # times the width of a new rule: it fires everywhere and no more rules are added
 LARGEST = 1e9  # no reward and no step size that make sense lead to a consequent beyond this
 FAILURES = (ArithmeticError, RuntimeError, ValueError, StopIteration)
@@ -63,7 +64,7 @@ def diagnose(agent: Learner, observation: np.ndarray) -> str:
     if net.n_rules == 0:
         return ""
     parts = {
-        "centres": (net.centres, FARTHEST),
+        "centres": (net.centres, net.centres.new_tensor([*map(farthest, agent.inputs)])),
         "widths": (net.widths, WIDEST * net.default_width),
         "consequents": (net.consequents, LARGEST),
         "eligibility traces": (net.traces.T, math.inf),
@@ -76,6 +77,12 @@ def diagnose(agent: Learner, observation: np.ndarray) -> str:
             count = f"{int(bad.sum())} of {net.n_rules} rules"
             return f"{name} of {count}, as in rule {rule + 1}: {worst}"
     return ""
+
+
+def farthest(axis: Axis) -> float:
+    """Where no centre on an axis makes sense any more."""
+    ends = [abs(end) for end in (axis.low, axis.high) if math.isfinite(end)]
+    return max(FARTHEST, *(10 * end for end in ends))
 
 
 def physics_warnings(env) -> str:

@@ -4,6 +4,7 @@ import contextlib
 import fcntl
 import itertools
 import os
+import re
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,8 +15,9 @@ UNNAMED = ".new-run"  # ending of a directory that is not yet whole
 
 
 def default_name(config: Config) -> str:
-    """Name of a run directory, e.g. sga-sofnn-estimated-s0."""
-    return f"{config.learner.name}-{config.network}-{config.pose}-s{config.seed}"
+    """Name of a run directory, e.g. sga-sofnn-estimated-s0, or sga-sofnn-MountainCar-v0-s0."""
+    task = config.pose if config.env == "maze" else re.sub(r"[^\w.-]+", "-", config.env)
+    return f"{config.learner.name}-{config.network}-{task}-s{config.seed}"
 
 
 def numbered(path: Path) -> Iterator[Path]:

@@ -1,5 +1,10 @@
-"""Named settings: ``default``, what works best, and ``paper``, every number as printed."""
+"""Named settings: ``default``, what works best, and ``paper``, every number as printed.
 
+In tasks other than the maze rewards are scaled so that values are about 1 (`sofnn_torch.tasks`),
+which makes one ``default`` serve all of them.
+"""
+
+import math
 from typing import Any
 
 from sofnn_torch.learners.qlearning import QConfig
@@ -13,6 +18,31 @@ TABLES = ("net", "sga", "q", "maze")
 def tables(agent: str, network: str, name: str) -> dict[str, Any]:
     """The tables of settings of a named preset for one of the four learners, or one's own."""
     return _paper(agent) if name == "paper" else _default(agent, network)
+
+
+def task_tables(agent: str, network: str, inputs: int) -> dict[str, Any]:
+    """The tables of the preset ``default`` for a task with as many inputs.
+
+    The square of a distance grows with the number of inputs, and so do the squares of the widths
+    beyond two inputs. A grid has about a thousand rules and widths of half its spacing.
+    """
+    along = max(2, int(1000 ** (1 / inputs) + 1e-9))
+    sharpness = 0.07 if agent == "q" else 0.1  # greedy action values need sharper sets
+    width = sharpness * max(1.0, math.sqrt(inputs / 2)) if network == "sofnn" else 0.5 / along
+    net = NetworkConfig(
+        theta=0.3 if agent == "q" else 0.4, width=(float(f"{width:.3g}"),), grid=(along,)
+    )
+    # A rule that fires alone for a whole trial is stable if rate_value < 2 (1 - gamma lambda).
+    sga = SGAConfig(
+        rate_value=0.3,
+        rate_deviation=1.0,
+        sigma_initial=1.0,
+        sigma_min=0.3,
+        initial_value=1.0,
+        replays=20,
+    )
+    q = QConfig(temperature=0.002, trace_decay=0.9, initial=1.0, value_limit=1.0)
+    return {"net": net, "sga": sga, "q": q, "maze": MazeConfig()}
 
 
 def _default(agent: str, network: str) -> dict[str, Any]:

@@ -86,9 +86,9 @@ class Session:
 
     def advance(self, record: TrialRecord) -> bool:
         """Take over the state after a trial; True if the last ten trials are the best so far."""
-        recent = [*self.state["recent"], [record.success, record.steps]][-WINDOW:]
+        recent = [*self.state["recent"], [record.outcome, record.steps]][-WINDOW:]
         best = former = self.state["best"]
-        if len(recent) == WINDOW:  # more successes are better, then fewer steps
+        if len(recent) == WINDOW:  # more successes or return, then fewer steps
             best = max(best, [sum(s for s, _ in recent), -sum(n for _, n in recent)])
         counters = {"trial": record.trial, "total_steps": record.total_steps}
         window = {"recent": recent, "best": best}

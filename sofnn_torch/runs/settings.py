@@ -13,20 +13,25 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
+import numpy as np
 import tyro
 
-from sofnn_torch.bounds import Settings, Within, flag, read
+from sofnn_torch.bounds import Positive, Settings, Within, flag, read
 from sofnn_torch.learners import learner_class
 from sofnn_torch.learners.learner import Learner, Task
 from sofnn_torch.learners.qlearning import QConfig
 from sofnn_torch.learners.sga import SGAConfig
 from sofnn_torch.maze.odometry import wheel_speeds
 from sofnn_torch.maze.settings import ACTION_NAMES, POSE, MazeConfig
-from sofnn_torch.network.axes import Axis
+from sofnn_torch.network.axes import Axis, named
 from sofnn_torch.network.settings import NetworkConfig
 from sofnn_torch.runs import presets
+from sofnn_torch.tasks.env import look
+from sofnn_torch.tasks.survey import survey
 
 PRESET: Any = None  # as a default: the value of the preset
+MAZE = "maze"
+Input = tuple[str, str, float, float, float]
 
 
 @dataclass(frozen=True)
@@ -41,6 +46,9 @@ class Config(Settings):
         100.0
     """
 
+    env: str = MAZE
+    """Task: `maze`, or the id of any environment that Gymnasium can make, as in `MountainCar-v0` or
+    `module:Id`."""
     agent: str = "sga"
     """Learner: `sga`, stochastic gradient ascent (section 3), `q`, Q-learning (section 4), or
     `module:Class` of one's own."""
@@ -59,6 +67,13 @@ class Config(Settings):
     sga: SGAConfig = PRESET
     q: QConfig = PRESET
     maze: MazeConfig = PRESET
+    axes: Annotated[tuple[Input, ...], tyro.conf.arg(metavar="NAME UNIT LOW HIGH PERIOD ...")] = ()
+    """Inputs of a task other than the maze, all of them in their order: name, unit, both ends, and
+    the period of one that wraps, or 0. By default those of its space; ends that it lacks are found
+    by random play."""
+    reward_scale: Positive = PRESET
+    """Factor of the rewards of a task other than the maze before they are learned from; by default
+    such that values are about 1."""
     own: Annotated[tuple[tuple[str, float], ...], tyro.conf.arg(metavar="NAME NUMBER ...")] = ()
     """Settings of a learner of one's own: names and numbers."""
 
@@ -66,11 +81,10 @@ class Config(Settings):
         """Take what is not given from the preset; ValueError names the flag and what is allowed."""
         if isinstance(self.own, Mapping):
             object.__setattr__(self, "own", tuple(self.own.items()))
-        missing = [name for name in presets.TABLES if getattr(self, name) is PRESET]
-        if missing:
-            tables = presets.tables(str(self.agent), self.network, self.preset)
-            for name in missing:
-                object.__setattr__(self, name, tables[name])
+        for name, value in self._preset().items():
+            given = getattr(self, name)
+            if given is PRESET or (name == "axes" and len(given) == 0):
+                object.__setattr__(self, name, value)
         super().__post_init__()
         self._check_together()
 
@@ -89,9 +103,13 @@ class Config(Settings):
 
     @property
     def task(self) -> Task:
-        """What the robot learns."""
-        kind = self.maze.actions
-        return Task(POSE, ACTION_NAMES[kind], kind == "three", wheel_speeds)
+        """What is learned."""
+        if self.env == MAZE:
+            kind = self.maze.actions
+            return Task(POSE, ACTION_NAMES[kind], kind == "three", wheel_speeds)
+        found, axes = look(self.env), named([Axis(*given) for given in self.axes])
+        scale = self.reward_scale
+        return Task(axes, found.actions, found.discrete, reward_scale=scale, patience=math.inf)
 
     def to_json(self) -> str:
         """The settings as readable JSON."""
@@ -99,16 +117,21 @@ class Config(Settings):
 
     def idle(self) -> dict[str, str]:
         """Settings, or whole tables of them, that change nothing beside the others, and why."""
-        used = self.learner.Settings.table
+        used, elsewhere = self.learner.Settings.table, f"with --env {self.env}"
         tables = {"sga": SGAConfig.table, "q": QConfig.table}
         idle = {name: f"with --agent {self.agent}" for name in tables if tables[name] != used}
         if used in tables:
             idle |= {f"{used}.{name}": why for name, why in self.learner_settings.idle().items()}
             idle["own"] = f"with --agent {self.agent}"
-        if self.maze.actions == "three":
-            idle["q.segments"] = "with --maze.actions three"
-        fixed, acting = self.network == "fixed", len(self._inputs) > len(POSE)
+        if self.task.discrete:
+            idle["q.segments"] = "with --maze.actions three" if self.env == MAZE else elsewhere
+        fixed, acting = self.network == "fixed", len(self._inputs) > len(self.task.axes)
+        idle |= dict.fromkeys(
+            ("axes", "reward_scale") if self.env == MAZE else ("maze", "pose"), elsewhere
+        )
         reasons = (
+            (self.env == MAZE, "width", elsewhere),
+            (self.env != MAZE, "width_position width_heading", elsewhere),
             (not acting, "grid_action width_action", "without --q.coding antecedent"),
             (fixed, "theta growth interpolate", "with --network fixed"),
             (not fixed, "grid grid_action", "without --network fixed"),
@@ -118,12 +141,63 @@ class Config(Settings):
         return idle
 
     @property
+    def widths(self) -> list[float]:
+        """Width of new membership functions on each input of the network, in its unit."""
+        net, axes = self.net, self.task.axes
+        if self.env == MAZE:
+            widths = [net.width_position, net.width_position, net.width_heading]
+        else:
+            shares = _each(net.width, len(axes), "--net.width")
+            widths = [v * (a.high - a.low) for v, a in zip(shares, axes, strict=True)]
+        return [*widths, net.width_action][: len(self._inputs)]
+
+    @property
+    def grid(self) -> tuple[int, ...]:
+        """Rules along each input of the fixed network."""
+        along = _each(self.net.grid, len(self.task.axes), "--net.grid")
+        return (*along, self.net.grid_action)[: len(self._inputs)]
+
+    def _preset(self) -> dict[str, Any]:
+        """The values of what is not given."""
+        agent, seed = str(self.agent), self.seed if np.issubdtype(type(self.seed), int) else 0
+        if self.env == MAZE or not isinstance(self.env, str):
+            return presets.tables(agent, self.network, self.preset) | {"reward_scale": 1.0}
+        if self.preset == "paper":
+            raise ValueError("--preset paper is for --env maze")
+        try:
+            found = (
+                look(self.env)
+                if self.axes and self.reward_scale
+                else survey(self.env, abs(int(seed)))
+            )
+        except ValueError as error:
+            raise ValueError(f"--env {error}") from None
+        tables = presets.task_tables(agent, self.network, len(found.axes))
+        axes = tuple((a.name, a.unit, a.low, a.high, a.period) for a in found.axes)
+        return tables | {"axes": axes, "reward_scale": found.reward_scale}
+
+    @property
     def _inputs(self) -> tuple[Axis, ...]:
         return self.learner.layout(self.learner_settings, self.task)[0]
 
+    def _check_axes(self) -> None:
+        """Raise ValueError on axes that are none, or not those of the environment."""
+        needed = len(look(self.env).axes)
+        if len(self.axes) != needed:
+            raise ValueError(
+                f"--axes must name all {needed} inputs of {self.env}, got {len(self.axes)}"
+            )
+        try:
+            named([Axis(*given) for given in self.axes])
+        except ValueError as error:
+            raise ValueError(f"--axes: {error}") from None
+
     def _check_together(self) -> None:
         """Raise ValueError on settings that exclude each other."""
-        settings, reward = self.learner_settings, self.maze.goal_reward
+        if self.env != MAZE:
+            self._check_axes()
+        settings = self.learner_settings
+        reward = self.maze.goal_reward if self.env == MAZE else -math.inf
         if self.own and "own" in self.idle():
             raise ValueError(f"--own is for a learner of one's own, not for --agent {self.agent}")
         limit = None if "value_limit" in settings.idle() else getattr(settings, "value_limit", None)
@@ -132,13 +206,19 @@ class Config(Settings):
                 f"{flag(settings.table, 'value_limit')} {limit:g} must be at least "
                 f"--maze.goal-reward {reward:g}, or None"
             )
-        inputs = self._inputs
-        if self.network == "fixed":
-            shape = (*self.net.grid, self.net.grid_action)[: len(inputs)]
-            if math.prod(shape) > self.net.max_rules:
-                raise ValueError(
-                    f"--net.grid {shape} has more rules than --net.max-rules {self.net.max_rules}"
-                )
+        _each(self.net.width, len(self.task.axes), "--net.width")
+        shape = self.grid  # also checks that the learner can do the task
+        if self.network == "fixed" and math.prod(shape) > self.net.max_rules:
+            raise ValueError(
+                f"--net.grid {shape} has more rules than --net.max-rules {self.net.max_rules}"
+            )
+
+
+def _each(values: tuple[Any, ...], count: int, name: str) -> tuple[Any, ...]:
+    """The values for each of the inputs, from as many or from one for all."""
+    if len(values) not in (1, count):
+        raise ValueError(f"{name} needs {count} values or one, got {len(values)}")
+    return values * count if len(values) == 1 else values
 
 
 def from_dict(data: Any) -> Config:

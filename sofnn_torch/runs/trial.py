@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sofnn_torch.learners.learner import Learner
-from sofnn_torch.maze.env import KheperaMazeEnv
 
 
 @dataclass(frozen=True)
@@ -19,43 +18,52 @@ class TrialRecord:
     steps: int
     """Simulator steps until the goal or the limit."""
     decisions: int
-    """Actions chosen; one is held for up to `hold` steps."""
+    """Actions chosen; in the maze one is held for up to `hold` steps."""
     total_steps: int
     """Simulator steps since the start of the run."""
     reward: float
     """Undiscounted sum of the rewards."""
-    success: bool
-    """The goal was reached."""
-    collisions: int
-    """Decisions that ended in a bump."""
-    subgoals: int
-    """Sub-goals found in this trial."""
+    success: bool | None
+    """The goal was reached; None for a task that does not say so."""
     rules: int
     """Rules after the trial."""
-    pose_error: float
-    """Mean distance of true and estimated position over the decisions, in metres."""
-    pose_error_max: float
-    """The largest of these distances, in metres."""
-    heading_error: float
-    """Mean absolute difference of true and estimated heading, in radians."""
+    measures: dict[str, float] = field(default_factory=dict)
+    """What the environment measured (`env.measure`)."""
     statistics: dict[str, float] = field(default_factory=dict)
     """What the learner measured (`agent.statistics()`)."""
+
+    @property
+    def outcome(self) -> float:
+        """What a trial is judged by: whether it reached the goal, or else its return."""
+        return self.reward if self.success is None else self.success
+
+    def row(self) -> dict[str, Any]:
+        """All numbers by their names, in the order of ``trials.csv``: counts before the rules."""
+        names = ("trial", "steps", "decisions", "total_steps", "reward", "success")
+        row = {name: getattr(self, name) for name in names}
+        if self.success is None:
+            del row["success"]
+        counts = {name: n for name, n in self.measures.items() if isinstance(n, int)}
+        return row | counts | {"rules": self.rules} | self.measures | self.statistics
 
 
 @dataclass
 class Trajectory:
-    """Poses (x [m], y [m], heading [rad]) at the start and after every decision of a trial.
+    """States at the start and after every decision of a trial.
+
+    In the maze they are poses (x [m], y [m], heading [rad]). In other tasks nobody knows more than
+    the learner: both are its observations.
 
     Attributes:
-        true: where the robot was. Shape: (T, 3).
-        estimated: where it believed to be. Shape: (T, 3).
+        true: where it was. Shape: (T, n).
+        estimated: where the learner believed to be. Shape: (T, n).
     """
 
-    true: NDArray[np.float64]
-    estimated: NDArray[np.float64]
+    true: NDArray[Any]
+    estimated: NDArray[Any]
 
-    def decided_at(self, pose: str) -> NDArray[np.float64]:
-        """The states (T - 1, 3) of the decisions, for a robot that knows its pose by this mode."""
+    def decided_at(self, pose: str) -> NDArray[Any]:
+        """The states (T - 1, n) of the decisions, for a robot that knows its pose by this mode."""
         return (self.true if pose == "true" else self.estimated)[:-1]
 
 
@@ -63,39 +71,42 @@ class Recorder:
     """Notes what happens in a trial, one decision after another.
 
     Args:
-        info: what the environment said at the start.
+        env: the environment, which says what else is measured.
+        observation: the first of the trial.
+        info: what the environment said with it.
     """
 
-    def __init__(self, info: dict[str, Any]):
-        self.reward, self.decisions, self.collisions = 0.0, 0, 0
-        self.true, self.estimated = [info["true_pose"]], [info["estimated_pose"]]
-        self.info = info
+    def __init__(self, env: Any, observation: NDArray[Any], info: dict[str, Any]):
+        self.env, self.reward = env, 0.0
+        self.observations, self.infos = [observation], [info]
 
-    def add(self, reward: float, info: dict[str, Any]) -> None:
-        """Note the reward of a decision and what the environment said of it."""
+    def add(self, reward: float, observation: NDArray[Any], info: dict[str, Any]) -> None:
+        """Note a decision: its reward, what it led to, and what the environment said of it."""
         self.reward += reward
-        self.decisions += 1
-        self.collisions += info["collision"]
-        self.true.append(info["true_pose"])
-        self.estimated.append(info["estimated_pose"])
-        self.info = info
+        self.observations.append(observation)
+        self.infos.append(info)
 
     def finish(
-        self, env: KheperaMazeEnv, agent: Learner, statistics: dict[str, float]
+        self, agent: Learner, statistics: dict[str, float]
     ) -> tuple[TrialRecord, Trajectory]:
-        """The record of the trial and the poses from the start on."""
-        path, info = Trajectory(np.array(self.true), np.array(self.estimated)), self.info
+        """The record of the trial and the states from the start on."""
+        last, seen = self.infos[-1], list(zip(self.infos, self.observations, strict=True))
+        path = Trajectory(
+            *(
+                np.array([info.get(name, x) for info, x in seen])
+                for name in ("true_pose", "estimated_pose")
+            )
+        )
+        success = last.get("success")
         record = TrialRecord(
             trial=0,
-            steps=info["total_steps"],
-            decisions=self.decisions,
-            total_steps=info["total_steps"],
+            steps=last["total_steps"],
+            decisions=len(self.infos) - 1,
+            total_steps=last["total_steps"],
             reward=float(self.reward),
-            success=bool(info["success"]),
-            collisions=int(self.collisions),
-            subgoals=sum(map(bool, info["subgoals"])),
+            success=None if success is None else bool(success),
             rules=agent.net.n_rules,
+            measures=self.env.unwrapped.measure(self.infos),
             statistics=statistics,
-            **env.unwrapped.measure(path.true, path.estimated),
         )
         return record, path

@@ -72,7 +72,7 @@ def under_conditions(path: Path) -> list[dict[str, Any]]:
                 env.close()
                 row = {"group": group, "value": value, "policy": policy}
                 for quantity in ("success", "steps", "collisions"):
-                    numbers = [getattr(record, quantity) for record in records]
+                    numbers = [record.row()[quantity] for record in records]
                     row[quantity] = round(float(np.mean(numbers)), 4)
                 rows.append(row)
     return rows

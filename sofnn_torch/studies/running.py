@@ -171,7 +171,7 @@ def _train_and_evaluate(path: Path, config: Config) -> dict[str, Any]:
     for policy in ("greedy", "sampled"):
         explore = policy == "sampled"
         records = evaluate.evaluate(config, agent, EPISODES, explore, results["seed"])
-        results[policy] = [dataclasses.asdict(record) for record in records]
+        results[policy] = [record.row() for record in records]
     if read_column(path / "trials.csv", "success")[-1]:
         record, trajectory = last_trial(path)
         results["last_trial"] = {
