@@ -88,10 +88,16 @@ def _achieved(run: Path) -> str:
     """What a training reached in its last trials, and the commands to see more of it."""
     _, state, _ = checkpoint.find_latest(run)
     recent, rules = state["recent"], plural(state["network"]["rules"], "rule")
-    arrived = [steps for success, steps in recent if success]
-    steps = f", {sum(arrived) / len(arrived):,.0f} steps on average" if arrived else ""
+    count = plural(len(recent), "trial")
+    if all(type(outcome) is bool for outcome, _ in recent):
+        arrived = [steps for success, steps in recent if success]
+        steps = f", {sum(arrived) / len(arrived):,.0f} steps on average" if arrived else ""
+        reached = f"goal in {len(arrived)} of the last {count}{steps}"
+    else:  # a task without success is judged by its return
+        mean = sum(outcome for outcome, _ in recent) / len(recent)
+        reached = f"return {mean:,.4g} on average of the last {count}"
     lines = [
-        f"goal in {len(arrived)} of the last {plural(len(recent), 'trial')}{steps}; {rules}",
+        f"{reached}; {rules}",
         "next:",
         f"  {program('evaluate')} {quoted(run)}",
         f"  {program('rules')} {quoted(run)}",

@@ -162,13 +162,14 @@ def evaluate(
     env = make_env(config, render_mode=render_mode)
     try:
         seeding.begin(env, agent, seed)
-        records, arrived = [], 0
+        records: list[TrialRecord] = []
         with Progress("evaluation", episodes, quiet=quiet) as progress:
             for trial in range(1, episodes + 1):
                 record, _ = play(env, agent, learn=False, explore=explore)
                 records.append(dataclasses.replace(record, trial=trial))
-                arrived += record.success
-                progress.update(facts=[f"goal in {arrived}", f"{record.steps} steps"])
+                mean = sum(r.outcome for r in records) / trial
+                said = f"return {mean:,.4g}" if record.success is None else f"goal in {mean:.0%}"
+                progress.update(facts=[said, f"{record.steps} steps"])
         return records
     finally:
         env.close()
