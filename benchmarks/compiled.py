@@ -52,7 +52,7 @@ class Decision:
         """
         net = self.net
         log_firing, best = self.covers(x, net._centres, net._widths)
-        assert best.item() > net.log_theta or net.n_rules == net.max_rules
+        assert best.item() > net.criterion.log_theta or net.n_rules == net.max_rules
         numbers = self.learn(
             log_firing,
             reward,

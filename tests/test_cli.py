@@ -235,7 +235,7 @@ def test_growth_without_end_stops_at_the_limit_and_says_so(agent, here, capsys):
         ("--net.theta \u0663e-1", "--net.theta must be a number, got '\u0663e-1'"),
         ("--trials 1_0", "--trials must be a whole number, got '1_0'"),
         ("--trials \u0663", "--trials must be a whole number, got '\u0663'"),
-        ("--network fixed --net.grid 4 4 1_0", "--net.grid must be int, int, int, got"),
+        ("--network fixed --net.grid 4 4 1_0", "--net.grid cannot be ['4', '4', '1_0']"),
         ("--own rate 1_0", "--own cannot be ['rate', '1_0']"),
         ("--seeds 1_0", "--seeds must be a list"),
         ("--seeds 0-\u0663", "--seeds must be a list"),

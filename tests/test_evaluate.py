@@ -98,7 +98,9 @@ def test_a_policy_that_never_arrives_still_gets_a_table(capsys):
 
 def test_the_table_is_in_the_units_that_it_names(capsys):
     known = {"pose_error": 0.0123, "pose_error_max": 0.0456, "heading_error": math.pi / 8}
-    rows = evaluate.summarise([replace(RECORD, collisions=3, **known)] * 2, optimum=400)
+    rows = evaluate.summarise(
+        [replace(RECORD, measures=MEASURES | {"collisions": 3} | known)] * 2, optimum=400
+    )
     evaluate.Console(width=100).print(evaluate.table(rows))
     lines = [line.split("│") for line in capsys.readouterr().out.splitlines() if "│" in line]
     printed = {line[1].strip(): line[2].strip() for line in lines}
@@ -106,6 +108,7 @@ def test_the_table_is_in_the_units_that_it_names(capsys):
         "trials that reached the goal, %": "100.0",
         "steps to the goal": "500.0",
         "over the kinematic optimum": "1.250",
+        "return": "1.00",
         "collisions per trial": "3.00",
         "position error, mean, mm": "12.30",
         "position error, largest, mm": "45.60",
@@ -312,11 +315,13 @@ def test_every_row_of_the_table_is_its_own_quantity_in_its_printed_unit():
         replace(
             RECORD,
             steps=500 + 100 * late,
-            collisions=2 + late,
-            subgoals=9,
-            pose_error=0.004,
-            pose_error_max=0.012,
-            heading_error=math.radians(3),
+            measures={
+                "collisions": 2 + late,
+                "subgoals": 9,
+                "pose_error": 0.004,
+                "pose_error_max": 0.012,
+                "heading_error": math.radians(3),
+            },
         )
         for late in (False, True)
     ]
@@ -328,6 +333,7 @@ def test_every_row_of_the_table_is_its_own_quantity_in_its_printed_unit():
         "steps to the goal": "550.0",
         "  over the kinematic optimum": "1.250",
         "steps of all trials": "7033.3",
+        "return": "1.00",
         "collisions per trial": "2.33",
         "position error, mean, mm": "4.00",
         "position error, largest, mm": "12.00",
@@ -347,7 +353,7 @@ def test_the_policy_that_is_named_is_the_one_that_plays_and_is_filmed(
         filmed.append((seed, explore))
         return iter([np.zeros((32, 32, 3), np.uint8)] * 2)
 
-    def evaluated(config, agent, episodes, explore, seed, *_):
+    def evaluated(config, agent, episodes, explore, seed, *_, **__):
         played.append((episodes, seed, explore))
         return [RECORD]
 

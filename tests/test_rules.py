@@ -352,7 +352,7 @@ def test_the_rules_at_a_state_add_up_to_what_the_learner_says(trained, variant):
         else:
             assert f"{action[-1]:.2f}".replace("-0.00", "0.00") in decision.action
             assert chosen is None or f"{chosen:.2f}" in decision.action
-        text = printed(rules.decision_table(said, decision))
+        text = printed(rules.decision_table(said, decision, variant == "q-antecedent"))
         shown = [line.split() for line in text.splitlines() if "±" in line]
         total = sum(float(words[1].rstrip("%")) for words in shown)
         assert 98.5 < total < 100.5
@@ -453,9 +453,9 @@ def test_files_are_the_same_every_time(run, tmp_path, call):
         (["RUN", "--tpo", "3"], "did you mean --top?"),
         (["RUN", "--top", "-1"], "--top must not be negative"),
         (["RUN", "--seed", "-1"], "--seed must not be negative"),
-        (["RUN", "--at", "0.1", "0.1"], "--at must be FLOAT FLOAT FLOAT or None, got ['0.1', '"),
-        (["RUN", "--at", "0.1", "nan", "0"], "--at must be FLOAT FLOAT FLOAT or None, got"),
-        (["RUN", "--at", "1_0", "0.1", "0"], "--at must be FLOAT FLOAT FLOAT or None, got"),
+        (["RUN", "--at", "0.1", "0.1"], "--at needs 3 numbers (x, y, heading), got 2"),
+        (["RUN", "--at", "0.1", "nan", "0"], "--at must be [FLOAT [FLOAT ...]] or None, got"),
+        (["RUN", "--at", "1_0", "0.1", "0"], "--at must be [FLOAT [FLOAT ...]] or None, got"),
         (["RUN", "--json", "rules.csv"], "--json must end in .json"),
         (["RUN", "--csv", "rules"], "--csv must end in .csv"),
         (["RUN", "--picture", "rules.gif"], "--picture must end in .png or .svg or .pdf"),

@@ -365,7 +365,7 @@ def test_the_start_is_scattered_to_both_sides_by_at_most_30_mm_and_20_degrees():
 
 def test_the_greedy_policy_is_played_without_chance_in_other_conditions(monkeypatch):
     config, explored = settings({"agent": "sga"}), []
-    record = SimpleNamespace(success=True, steps=1, collisions=0)
+    record = SimpleNamespace(row=lambda: {"success": True, "steps": 1, "collisions": 0})
 
     def play(env, agent, learn, explore):
         explored.append(explore)
@@ -388,6 +388,9 @@ def test_the_greedy_policy_is_evaluated_without_chance_and_the_last_path_is_kept
     @dataclasses.dataclass
     class Record:
         steps: int
+
+        def row(self):
+            return dataclasses.asdict(self)
 
     def evaluated(config, agent, episodes, explore, seed):
         played.append((episodes, explore, seed))
