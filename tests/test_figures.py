@@ -181,3 +181,38 @@ def test_a_figure_becomes_a_png_of_its_size(plan):
     figures.trajectory(plan, path, left)
     figures.value_field(plan, learner("sga"), right, columns=8, headings=2)
     assert Image.open(io.BytesIO(figures.png(figure, dpi=50))).size == (300, 100)
+
+
+def test_the_band_of_learning_curves_lies_between_the_quartiles_and_seeds_begin_with_trial_1(axes):
+    runs = [np.array([seed, 10.0 * seed]) for seed in (1, 2, 3, 4, 5)]
+    figures.learning_curves({"arm": runs}, axes, "rules")
+    (band,) = axes.collections
+    low, high = band.get_paths()[0].get_extents().get_points()
+    assert (*low, *high) == pytest.approx((1, 2, 2, 40))
+    assert {tuple(line.get_xdata()) for line in axes.lines} == {(1, 2)}
+
+
+def test_subgoals_are_shaded_from_half_a_decision_before_to_half_a_decision_after(plan, axes):
+    inside, outside = (*plan.subgoals[0], 0.0), (*plan.start[:2], 0.0)
+    true = np.array([outside, outside, inside, inside, outside])
+    figures.pose_error(Trajectory(true, true), axes, plan)
+    (shade,) = axes.patches
+    assert (shade.get_x(), shade.get_x() + shade.get_width()) == (1.5, 3.5)
+
+
+def test_the_value_field_shows_the_best_heading(plan, axes):
+    agent = learner("sga")
+    figures.value_field(plan, agent, axes, columns=10, headings=4)
+    picture = axes.images[0].get_array()
+    x0, y0, x1, _ = figures.bounds(plan)
+    step = (x1 - x0) / 10
+    at = [[x0 + 3.5 * step, y0 + 6.5 * step, turn * math.pi / 2] for turn in range(-2, 2)]
+    assert picture[6, 3] == pytest.approx(agent.plan(np.array(at)).value.max(), rel=1e-5)
+
+
+def test_a_membership_function_is_1_at_its_centre_and_falls_as_equation_1_says(axes):
+    agent = learner("sga")
+    figures.memberships(agent, 0, axes, {4: "rule"})
+    x, y = axes.lines[0].get_data()
+    distance = (x - STATES[4, 0]) / agent.net.widths[4, 0].item()
+    assert y == pytest.approx(np.exp(-(distance**2) / 2), abs=1e-5)

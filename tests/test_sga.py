@@ -293,3 +293,20 @@ def test_a_rate_moves_its_own_part_of_the_antecedents_alone(part):
     agent.step(1.0, np.array([0.2, -0.2, 0.5]), True)
     after = {"centre": agent.net.centres, "width": agent.net.widths}
     assert [name for name in before if not torch.equal(before[name], after[name])] == [part]
+
+
+def test_statistics_are_of_the_decisions_since_the_last_ones():
+    agent = learner(rules=3, baseline="constant", rate_mean=0, rate_deviation=0, sigma_max=2)
+    agent.net.max_rules = 3
+    xs = [np.array([0.1 * i, -0.2, 0.5]) for i in range(4)]
+    agent.start(xs[0])
+    for x, reward in zip(xs[1:], (1.0, 2.0, 5.0), strict=True):
+        agent.step(reward, x, False)
+    outputs = agent.net(torch.tensor(np.array(xs))).detach()
+    found = agent.statistics()
+    assert found["policy/mu_mean"] == pytest.approx(outputs[:, 0].mean().item())
+    assert found["policy/mu_deviation"] == pytest.approx(outputs[:, 0].numpy().std())
+    assert found["policy/sigma_mean"] == pytest.approx(outputs[:, 1].mean().item())
+    assert found["policy/sigma_min"] == pytest.approx(outputs[:, 1].min().item())
+    assert found["learning/error_rms"] == pytest.approx(math.sqrt(30 / 3))
+    assert not agent.statistics()
