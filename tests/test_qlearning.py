@@ -293,3 +293,30 @@ def test_a_rate_moves_its_own_part_of_the_antecedents_alone(part):
     agent.step(1.0, np.array([0.2, -0.2, 0.5]), True)
     after = {"centre": agent.net.centres, "width": agent.net.widths}
     assert [name for name in before if not torch.equal(before[name], after[name])] == [part]
+
+
+def test_statistics_are_of_the_decisions_since_the_last_ones():
+    agent = learner(rules=3, temperature=1e3)  # all actions about as likely
+    greedy, values = [], []
+
+    def note(x):
+        with torch.no_grad():
+            firing = agent.net.normalised_firing(torch.from_numpy(x))
+            worth = agent.action_values(torch.from_numpy(x), firing).tolist()
+        values.append(agent.value)
+        greedy.append(agent.value == pytest.approx(max(worth)))
+
+    agent.rates.zero_()
+    agent.net.max_rules = 3
+    xs = [np.array([0.1 * i, -0.2, 0.5]) for i in range(30)]
+    agent.start(xs[0])
+    note(xs[0])
+    for x in xs[1:]:
+        agent.step(1.0, x, False)
+        note(x)
+    found = agent.statistics()
+    assert 0 < sum(greedy) < 30
+    assert found["policy/greedy_share"] == pytest.approx(sum(greedy) / 30)
+    assert found["policy/value_mean"] == pytest.approx(sum(values) / 30, rel=1e-5)
+    assert found["policy/value_max"] == pytest.approx(max(values), rel=1e-5)
+    assert not agent.statistics()
