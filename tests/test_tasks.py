@@ -307,6 +307,23 @@ def test_the_film_shows_the_trial_that_evaluation_plays(toy, monkeypatch):
     assert agent.rng.bit_generator.state == before
 
 
+def test_the_film_shows_the_states_that_evaluation_meets(toy, monkeypatch):
+    config, met, observe = short(toy(steps=3)), [], Toy._observe
+    agent, env = build(config)
+    training.play(env, agent)
+
+    def noted(self):
+        met.append(observe(self))
+        return met[-1]
+
+    monkeypatch.setattr(Toy, "_observe", noted)
+    monkeypatch.setattr(Toy, "render", lambda self: met[-1][0], raising=False)
+    frames = list(film(config, agent, seed=4))
+    met.clear()
+    evaluate.evaluate(config, agent, 1, seed=4)
+    assert frames == [state[0] for state in met[-4:]]
+
+
 def test_a_state_is_given_in_the_units_of_the_task(tmp_path, capsys, monkeypatch):
     run = str(training.train(short("MountainCar-v0"), quick_options(tmp_path)))
 

@@ -240,7 +240,7 @@ def test_the_film_shows_the_trial_that_evaluation_plays(sga_trial, monkeypatch, 
     before_film = agent.rng.bit_generator.state
     monkeypatch.setattr(film_module, "OffscreenRenderer", Camera)
     before = Camera.closed
-    frames = list(film(config, agent, 5, explore, steps_per_frame=4))
+    frames = list(film(config, agent, seed=5, explore=explore, steps_per_frame=4))
     assert len(frames) == 1 + 150 // 4 + 1  # the start, every fourth step, the end
     assert frames[0][0, 0] == pytest.approx(path.true[0, :2])
     assert frames[-1][0, 0] == pytest.approx(path.true[-1, :2])

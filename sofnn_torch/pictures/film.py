@@ -46,9 +46,8 @@ def task_film(
     """Frames as the environment draws them, one for each step."""
     env = make_env(config, "rgb_array")
     rng = agent.rng  # a film must not change the training
-    agent.reseed(seed)
     try:
-        env.reset(seed=seed)
+        seeding.begin(env, agent, seed)
         observation, _ = env.reset()  # as in a series of trials, where only the first is seeded
         policy, over = FrozenPolicy(agent, explore), False
         yield env.render()
