@@ -427,3 +427,16 @@ def test_the_default_maze_is_the_one_that_training_uses():
         assert getattr(made, name) == getattr(trained, name), name
     assert vars(made.noise) == vars(trained.noise)
     assert vars(made.estimator) == vars(trained.estimator)
+
+
+def test_a_trial_is_measured_by_its_bumps_and_all_the_subgoals_that_it_found():
+    env = KheperaMazeEnv()
+    pose = np.zeros(3)
+    bumps, found = [True, True, False, True], [(False, False)] * 2 + [(True, False), (True, True)]
+    infos = [
+        {"collision": bump, "subgoals": zones, "true_pose": pose, "estimated_pose": pose}
+        for bump, zones in zip(bumps, found, strict=True)
+    ]
+    measured = env.measure(infos)
+    env.close()
+    assert (measured["collisions"], measured["subgoals"]) == (2, 2)  # none before the first action
