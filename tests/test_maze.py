@@ -192,6 +192,8 @@ def test_a_literal_estimate_may_leave_the_arena_by_what_a_trial_can_drive():
     space = KheperaMazeEnv(dead_reckoning="literal", max_steps=100).observation_space
     assert space.low[:2] == pytest.approx([-0.5, -0.5])  # 100 steps of 5 mm
     assert space.high[:2] == pytest.approx([1.5, 1.5])
+    believed = KheperaMazeEnv(dead_reckoning="literal", max_steps=100, wheel_radius_scale=2.0)
+    assert believed.observation_space.low[:2] == pytest.approx([-1.0, -1.0])
 
 
 def test_steering_contains_the_three_actions():

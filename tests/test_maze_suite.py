@@ -53,6 +53,18 @@ def test_gymnasium_accepts_the_environment(kind):
 
 
 @every_kind
+def test_the_observation_is_the_pose_that_was_asked_for(kind):
+    env = KheperaMazeEnv(**kind)
+    observation, info = env.reset(seed=0, options={"pose": (0.4, 0.5, 0.0)})  # far from landmarks
+    known = "true_pose" if kind.get("pose") == "true" else "estimated_pose"
+    env.action_space.seed(0)
+    for _ in range(5):
+        np.testing.assert_array_equal(observation[:3], np.float32(info[known]))
+        observation, *_, info = env.step(env.action_space.sample())
+    assert (info["true_pose"] != info["estimated_pose"]).any()
+
+
+@every_kind
 def test_a_seed_decides_the_trajectory(kind):
     env, other = (KheperaMazeEnv(max_steps=120, **kind) for _ in range(2))
     runs = []

@@ -72,6 +72,9 @@ def test_trail_and_ghost_are_drawn_where_they_are(draw):
 def test_a_very_long_trail_is_thinned_out(draw):
     way = np.random.default_rng(0).uniform(0.1, 0.9, (20_000, 2))
     assert np.abs(draw(way.tolist()) - draw()).mean() > 5
+    waiting = [(0.2, 0.15)] * 20_000
+    moved = np.abs(draw([*waiting, (0.8, 0.15)]) - draw(waiting)).max(axis=2) > 30
+    assert moved.sum() > 50  # its end is drawn, however long it has stood before
 
 
 @needs_gl

@@ -100,6 +100,15 @@ def test_infrared_ranges_see_walls():
     assert ranges["ir_back_left"] == ranges["ir_right_90"] == 0.1
 
 
+def test_ranges_are_only_computed_when_they_are_asked_for():
+    physics = Physics()
+    physics.infrared_ranges()
+    assert physics.data.sensordata.any()
+    physics.place((0.93, 0.15, 0.0))
+    physics.drive(*FORWARD)
+    assert not physics.data.sensordata.any()  # as the reset has left it
+
+
 def test_every_element_is_named():
     model = load_model()
     counts = {"joint": "njnt", "camera": "ncam", "actuator": "nu", "mat": "nmat", "tex": "ntex"}

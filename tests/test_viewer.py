@@ -91,6 +91,7 @@ def test_the_window_shows_every_step_with_trial_time_decision_and_rule(maze, win
 
 def test_the_space_bar_pauses_and_the_right_arrow_makes_one_step(maze, windows):
     (window,) = windows
+    window.press(viewer.RIGHT_ARROW)  # which does nothing before the pause
     window.press(viewer.SPACE)
     driver = threading.Thread(target=maze.step, args=(STRAIGHT,), daemon=True)
     driver.start()
