@@ -267,6 +267,21 @@ def printed(view, width=100):
     return console.file.getvalue()
 
 
+@pytest.mark.parametrize("width", [60, 70, 80, 200])
+def test_a_table_in_a_narrow_terminal_loses_nothing(width, monkeypatch):
+    learner = small((0.5, 0.1, 0.65), (-0.25, 0.3, -0.001))
+    view = rules.table(words.read(learner), np.array([0.25, 0.75]), top=20)
+    whole = printed(view, 200)
+    terminal = Console(width=width, file=io.StringIO(), force_terminal=True, color_system=None)
+    monkeypatch.setattr(rules, "Console", lambda: terminal)
+    rules.show(view)
+    text = terminal.file.getvalue()
+    assert "…" not in text and max(map(len, text.splitlines())) <= width
+    assert sorted(text.split()) == sorted(whole.split()) or width < 80
+    for word in ("value", "sigma", "straight", "0.30", "-0.25", "75.0%", "750"):
+        assert word in text
+
+
 def test_the_table_of_two_rules():
     learner = small((0.5, 0.1, 0.65), (-0.25, 0.3, -0.001))
     said = words.read(learner)

@@ -44,6 +44,7 @@ from sofnn_torch.terminal import command, plural, say
 from sofnn_torch.training import play
 
 PICTURES = (".png", ".svg", ".pdf")
+WIDEST = 1000  # columns of a table for which there is room
 WIDTH = 100  # columns of a table that does not go to a terminal
 ENOUGH = 0.99  # share of the firing that decides at a pose
 FIRED = 0.01  # a rule with less firing in all of a trial took no part, as in docs/metrics.md
@@ -187,9 +188,15 @@ def _headed(reading: Reading, consequents: Iterable[str]) -> Table:
 
 
 def show(view: Table) -> None:
-    """Print a table, in full width where the output is no terminal."""
+    """Print a table: in full width where there is no terminal, broken at words in a narrow one."""
     console = Console()
-    (console if console.is_terminal else Console(width=WIDTH)).print(view)
+    console = console if console.is_terminal else Console(width=WIDTH)
+    if console.measure(view, options=console.options.update(width=WIDEST)).maximum > console.width:
+        view.padding, view.show_edge = 0, False
+        for column in view.columns:
+            text = "\n".join(map(str, [column.header, *column.cells]))
+            column.no_wrap, column.width = False, max(map(len, text.split()), default=1)
+    console.print(view)
 
 
 def state_of(options: Options, config: Config) -> NDArray[np.float32]:

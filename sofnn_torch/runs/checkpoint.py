@@ -68,30 +68,7 @@ def load(path: Path) -> dict[str, Any]:
     Raises:
         CheckpointError: no such file, not a checkpoint, damaged, or of a newer version.
     """
-    try:
-        with open(path, "rb") as file:
-            header = HEADER.fullmatch(file.readline(HEADER_SIZE))
-            if header is None:
-                raise CheckpointError(f"{path}: not a checkpoint of sofnn-torch")
-        payload = memoryview(read_file(path, LARGEST))[header.end() :]
-    except OSError as error:
-        raise CheckpointError(f"{path}: cannot be read ({error.strerror})") from None
-    except CheckpointError:
-        raise
-    except ValueError as error:
-        raise CheckpointError(f"{path}: {error}") from None
-    version = int(header[1])
-    if header[2] != _digest(version, payload):
-        raise CheckpointError(f"{path}: damaged or cut off (its checksum differs){ADVICE}")
-    if version > VERSION:
-        raise CheckpointError(
-            f"{path}: format {version}, this program reads up to {VERSION}; update sofnn-torch"
-        )
-    if version < VERSION:
-        raise CheckpointError(
-            f"{path}: format {version} of an older version, this program reads {VERSION}: train "
-            "anew, or use the version of sofnn-torch that wrote it (0.1.0)"
-        )
+    payload = _payload(path)
     try:
         _check_parts(payload)
         state = torch.load(io.BytesIO(payload), weights_only=True)
@@ -243,6 +220,37 @@ def sync_directory(directory: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+def _payload(path: Path) -> memoryview:
+    """The payload of a file of this format that is as it was written.
+
+    Raises:
+        CheckpointError: it is not.
+    """
+    try:
+        with open(path, "rb") as file:
+            header = HEADER.fullmatch(file.readline(HEADER_SIZE))
+        data = read_file(path, LARGEST) if header else b""
+    except OSError as error:
+        raise CheckpointError(f"{path}: cannot be read ({error.strerror})") from None
+    except ValueError as error:
+        raise CheckpointError(f"{path}: {error}") from None
+    if header is None:
+        raise CheckpointError(f"{path}: not a checkpoint of sofnn-torch")
+    version, payload = int(header[1]), memoryview(data)[header.end() :]
+    if header[2] != _digest(version, payload):
+        raise CheckpointError(f"{path}: damaged or cut off (its checksum differs){ADVICE}")
+    if version > VERSION:
+        raise CheckpointError(
+            f"{path}: format {version}, this program reads up to {VERSION}; update sofnn-torch"
+        )
+    if version < VERSION:
+        raise CheckpointError(
+            f"{path}: format {version} of an older version, this program reads {VERSION}: train "
+            "anew, or use the version of sofnn-torch that wrote it (0.1.0)"
+        )
+    return payload
 
 
 def read_file(path: Path, most: int) -> bytes:
