@@ -21,7 +21,12 @@ import numpy as np
 
 INTEGER = 2**63  # no whole number reaches it, so that every array and file can hold it
 FINITE = 1e300
-KINDS = {bool: np.bool_, int: np.integer, float: (int, np.integer, np.floating), str: Path}
+KINDS: dict[type, type | tuple[type, ...]] = {
+    bool: np.bool_,
+    int: np.integer,
+    float: (int, np.integer, np.floating),
+    str: Path,
+}
 NAMES = {bool: "True or False", int: "a whole number", float: "a number", str: "text"}
 
 

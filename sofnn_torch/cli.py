@@ -11,7 +11,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NoReturn
 
 import tyro
 
@@ -125,7 +125,7 @@ def parse(argv: Sequence[str]) -> Flags:
     unchanged = Flags(config=base, options=RunOptions())
     flags = parse_flags(Flags, argv, EXAMPLES, unchanged)
     if flags.resume:
-        _keep_settings(flags, base)
+        _keep_settings(flags, flags.resume, base)
     _refuse_idle(flags, unchanged)
     if flags.seeds is not None and flags.config.seed != Config.seed:
         raise ValueError("--seed and --seeds exclude each other")
@@ -133,7 +133,7 @@ def parse(argv: Sequence[str]) -> Flags:
 
 
 class _Parser(argparse.ArgumentParser):
-    def error(self, message: str) -> None:
+    def error(self, message: str) -> NoReturn:
         raise ValueError(message)
 
 
@@ -148,18 +148,18 @@ def _preset(known: argparse.Namespace) -> Config:
         return Config()  # no such preset: all flags are checked next
 
 
-def _keep_settings(flags: Flags, base: Config) -> None:
+def _keep_settings(flags: Flags, run: Path, base: Config) -> None:
     """Refuse flags that contradict the run to resume."""
     if flags.seeds is not None or flags.replay:
         raise ValueError("--resume goes with neither --seeds nor --replay")
     moved = {"name", "runs"} & set(_changes(flags.options, RunOptions()))
-    if moved and home_of(flags.resume):
+    if moved and home_of(run):
         raise ValueError(f"--{min(moved)} is for new runs; a resumed run keeps its directory")
     asked = dataclasses.replace(flags.config, trials=base.trials)
     for name in _changes(asked, base):
         ours, theirs = (directory.flatten(dataclasses.asdict(c))[name] for c in (asked, base))
         raise ValueError(
-            f"{_flag(name)} {ours} contradicts {flags.resume}, which has {theirs}: "
+            f"{_flag(name)} {ours} contradicts {run}, which has {theirs}: "
             "a run keeps its settings; only --trials may be raised"
         )
 

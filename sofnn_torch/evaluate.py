@@ -37,7 +37,7 @@ from sofnn_torch.pictures.film import film, gif, mp4
 from sofnn_torch.progress import Progress
 from sofnn_torch.runs import checkpoint, seeding
 from sofnn_torch.runs.directory import same_settings
-from sofnn_torch.runs.factory import make_agent, make_env
+from sofnn_torch.runs.factory import make_agent, make_env, make_plan
 from sofnn_torch.runs.provenance import versions
 from sofnn_torch.runs.session import arithmetic, saved_config
 from sofnn_torch.runs.settings import MAZE, Config
@@ -270,10 +270,7 @@ def optimum(config: Config) -> float | None:
     """Steps of the best noise-free run through the maze; None for other tasks."""
     if config.env != MAZE:
         return None
-    env = make_env(config)
-    steps = optimal_steps(env.unwrapped.plan, config.maze.hold).steps
-    env.close()
-    return steps
+    return optimal_steps(make_plan(config), config.maze.hold).steps
 
 
 @arithmetic()

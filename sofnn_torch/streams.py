@@ -22,7 +22,8 @@ def output() -> Iterator[list[OSError]]:
     Yields:
         The errors of standard output by which results were lost; complete after the block.
     """
-    former, refused = (sys.stdout, sys.stderr), []
+    former = (sys.stdout, sys.stderr)
+    refused: list[OSError] = []
     sys.stdout = _lasting(sys.stdout, 1, None, refused)
     sys.stderr = _lasting(sys.stderr, 2, PATIENCE, [])
     try:

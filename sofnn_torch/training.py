@@ -10,9 +10,10 @@ import time
 from pathlib import Path
 from typing import Any
 
+import gymnasium
+
 from sofnn_torch.learners.frozen import FrozenPolicy
-from sofnn_torch.learners.learner import Learner
-from sofnn_torch.maze.env import KheperaMazeEnv
+from sofnn_torch.learners.learner import Action, Learner
 from sofnn_torch.pictures.tensorboard import Monitor
 from sofnn_torch.progress import Progress
 from sofnn_torch.runs import checkpoint, session
@@ -28,7 +29,7 @@ __all__ = ["RunOptions", "play", "replay", "resume", "train"]
 
 
 def play(
-    env: KheperaMazeEnv,
+    env: gymnasium.Env[Any, Any],
     agent: Learner,
     learn: bool = True,
     explore: bool = True,
@@ -37,7 +38,7 @@ def play(
     """One trial from the start to the goal or the trial's limit.
 
     Args:
-        env: the maze.
+        env: as `make_env` makes it, or a wrapper around it.
         agent: the learner.
         learn: learn and grow; otherwise the agent is left as it is.
         explore: choose actions as in training (always so if learn).
@@ -54,11 +55,12 @@ def play(
     observation, info = env.reset()
     recorder = Recorder(env, observation, info)
     with Watch(agent, env, observation) as watch:
-        action = policy.start(observation)
+        action: Action | None = policy.start(observation)
         while action is not None:
             if trap and trap.number:
                 raise Interrupted(trap.number)
-            observation, reward, terminated, truncated, info = env.step(action)
+            observation, gain, terminated, truncated, info = env.step(action)
+            reward = float(gain)
             watch.observation = observation
             action = policy.step(reward, observation, terminated, truncated)
             recorder.add(reward, observation, info)

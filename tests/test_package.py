@@ -71,9 +71,9 @@ def test_files_are_data():
                 assert safe.get("weights_only") == "True", f"{path}: {ast.unparse(node)}"
 
 
-def test_the_wheel_holds_the_assets_and_no_tests(wheel):
+def test_the_wheel_holds_the_assets_and_its_types_and_no_tests(wheel):
     names = set(zipfile.ZipFile(wheel).namelist())
-    assert "sofnn_torch/assets/khepera_maze.xml" in names
+    assert {"sofnn_torch/assets/khepera_maze.xml", "sofnn_torch/py.typed"} <= names
     assert not [name for name in names if name.startswith(("tests", "docs", "runs"))]
 
 

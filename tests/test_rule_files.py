@@ -507,7 +507,7 @@ def test_broken_files_load_whole_or_not_at_all(few, tmp_path, monkeypatch, suffi
         rule_file.write_bytes(data)
         options = rules.Options(run=path, load=rule_file)
         try:
-            rules.edit(options, config, agent, file, state)
+            rules.edit(options, rule_file, config, agent, file, state)
         except Accepted:
             outcomes["accepted"] += 1
             table = parameters(agent)

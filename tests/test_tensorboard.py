@@ -268,7 +268,7 @@ def test_a_film_shows_the_maze_that_the_robot_is_in(sga_trial, monkeypatch, tmp_
             super().__init__(model, *size)
 
     monkeypatch.setattr(film_module, "OffscreenRenderer", Screen)
-    monkeypatch.setattr(film_module, "make_env", lambda _: KheperaMazeEnv(model_path=path))
+    monkeypatch.setattr(film_module, "make_maze", lambda _: KheperaMazeEnv(model_path=path))
     next(film(config, agent))
     assert "wall_upper" in shown[0] and "wall_lower" not in shown[0]
 

@@ -238,7 +238,8 @@ class Learner(ABC):
         """Mean normalised firing of each rule (K,) along a trial, from its states (T, n)."""
         inputs = self.network_inputs(self._tensor(np.asarray(states))).reshape(-1, len(self.inputs))
         parts = inputs.split(CHUNK)
-        total = sum(self.net.normalised_firing(part).sum(0) for part in parts)
+        none = inputs.new_zeros(self.net.n_rules)
+        total = sum((self.net.normalised_firing(part).sum(0) for part in parts), none)
         return (total / len(inputs)).double().numpy()
 
     def conclusions(self, x: Tensor) -> tuple[list[str], NDArray[np.float64]]:

@@ -208,7 +208,7 @@ class KheperaMazeEnv(gymnasium.Env[np.ndarray, Any]):
                 raise ValueError(f"action must be {names}, not {show(action)}")
             steer = number - 1.0
         else:
-            values = vector("action", action, self.action_space.shape[0], bound=1.0)
+            values = vector("action", action, len(self.action_names), bound=1.0)
             if self.actions == "wheels":
                 return values[0] * FORWARD_SPEED, values[1] * FORWARD_SPEED
             steer = values[0]
@@ -233,8 +233,9 @@ class KheperaMazeEnv(gymnasium.Env[np.ndarray, Any]):
                 self._renderer = Viewer(model, self.speed, self.camera)
             else:
                 self._renderer = OffscreenRenderer(model, self.width, self.height)
-        if self.render_mode == "human":
-            return self._renderer.draw(qpos, self.trail, estimate, self._texts())
+        if isinstance(self._renderer, Viewer):
+            self._renderer.draw(qpos, self.trail, estimate, self._texts())
+            return None
         return self._renderer.draw(qpos, self.trail, estimate, self.camera)
 
     def _texts(self) -> dict[str, str]:
@@ -375,15 +376,17 @@ class KheperaMazeEnv(gymnasium.Env[np.ndarray, Any]):
         if self.range_sensors:
             low += [0.0] * 9
             high += [INFRARED_RANGE] * 8 + [1.0]
-        return gymnasium.spaces.Box(np.float32(low), np.float32(high), dtype=np.float32)
+        return gymnasium.spaces.Box(
+            np.array(low, np.float32), np.array(high, np.float32), dtype=np.float32
+        )
 
     def _start_pose(self, options: dict[str, Any]) -> Pose:
         unknown = set(options) - {"pose"}
         if unknown:
             raise ValueError(f'unknown reset options {sorted(unknown)}: only "pose" is known')
-        pose = tuple(vector("the reset pose", options.get("pose", self.plan.start), 3))
+        x, y, heading = vector("the reset pose", options.get("pose", self.plan.start), 3)
         width, height = self.plan.size
-        inside = 0.0 < pose[0] < width and 0.0 < pose[1] < height
-        if not inside or self.plan.clearance(pose[0], pose[1]) < 0.0:
-            raise ValueError(f"the robot cannot be put at {pose[:2]}: a wall is there")
-        return pose
+        inside = 0.0 < x < width and 0.0 < y < height
+        if not inside or self.plan.clearance(x, y) < 0.0:
+            raise ValueError(f"the robot cannot be put at {(x, y)}: a wall is there")
+        return x, y, heading

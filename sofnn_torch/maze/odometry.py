@@ -168,7 +168,7 @@ def wheel_speeds(steer: float) -> list[float]:
     return [forward - turn, forward + turn]
 
 
-def motion(actions: NDArray[Any]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def motion(actions: NDArray[Any]) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
     """How actions move a robot: forward and to the left, each over the fastest. Shapes: (B,).
 
     Args:

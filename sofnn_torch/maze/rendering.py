@@ -121,8 +121,8 @@ def choose_backend() -> str:
         return wanted
     if has_display():
         return "glfw"
-    for name in ("egl", "osmesa"):
-        if ctypes.util.find_library(BACKENDS[name][1]):
+    for name, (_, library, _) in BACKENDS.items():
+        if library and ctypes.util.find_library(library):
             return name
     raise RenderingError(
         "cannot draw without a display: install EGL (Debian: apt install libegl1) "
@@ -173,8 +173,9 @@ def _forget_contexts() -> None:
     """In a forked process, leave the contexts to the one that owns them."""
     for resource in itertools.chain(*_contexts.values()):
         ctypes.pythonapi.Py_IncRef(ctypes.py_object(resource))  # deleted, it would call OpenGL
-    if "mujoco.egl" in sys.modules:
-        sys.modules["mujoco.egl"].EGL_DISPLAY = None  # as would MuJoCo at exit
+    egl: Any = sys.modules.get("mujoco.egl")
+    if egl:
+        egl.EGL_DISPLAY = None  # as would MuJoCo at exit
 
 
 if hasattr(os, "register_at_fork"):

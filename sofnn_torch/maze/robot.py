@@ -120,22 +120,21 @@ class Physics:
         Raises:
             ValueError: if the file is missing or the timestep does not divide 0.5 s.
         """
-        if not isinstance(model, mujoco.MjModel):
-            model = load_model(model, drawn=False)
-        self.model = model
-        self.substeps = round(STEP_SECONDS / model.opt.timestep)
-        if abs(self.substeps * model.opt.timestep - STEP_SECONDS) > 1e-9:
-            raise ValueError(f"timestep {model.opt.timestep} s does not divide {STEP_SECONDS} s")
+        self.model = model if isinstance(model, mujoco.MjModel) else load_model(model, drawn=False)
+        timestep = self.model.opt.timestep
+        self.substeps = round(STEP_SECONDS / timestep)
+        if abs(self.substeps * timestep - STEP_SECONDS) > 1e-9:
+            raise ValueError(f"timestep {timestep} s does not divide {STEP_SECONDS} s")
         # Sensors are evaluated on demand: 8 rays in every timestep would double its cost.
-        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_SENSOR
-        self.data = mujoco.MjData(model)
+        self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_SENSOR
+        self.data = mujoco.MjData(self.model)
         try:
-            self.plan = MazePlan.from_model(model)
-            self._left_wheel = model.joint("wheel_left").qposadr.item()
-            self._right_wheel = model.joint("wheel_right").qposadr.item()
-            self._floor = model.geom("floor").id
+            self.plan = MazePlan.from_model(self.model)
+            self._left_wheel = self.model.joint("wheel_left").qposadr.item()
+            self._right_wheel = self.model.joint("wheel_right").qposadr.item()
+            self._floor = self.model.geom("floor").id
             for name in INFRARED:
-                model.sensor(name)
+                self.model.sensor(name)
         except KeyError as error:
             what = str(error.args[0]).split(". Valid")[0]
             raise ValueError(f"the model lacks an element of the standard maze: {what}") from error

@@ -117,7 +117,7 @@ class Viewer:
             with self._handle.lock():
                 self._point_camera()
         corner = mujoco.mjtGridPos
-        state = texts | {"speed": "paused" if self.paused else f"{self.speed:g} x"}
+        state = {**texts, "speed": "paused" if self.paused else f"{self.speed:g} x"}
         self._handle.set_texts(
             [
                 (None, corner.mjGRID_TOPLEFT, "\n".join(state), "\n".join(state.values())),

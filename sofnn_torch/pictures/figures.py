@@ -18,6 +18,8 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
+from matplotlib.font_manager import FontProperties
+from matplotlib.legend import Legend
 from matplotlib.patches import Circle, Rectangle
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import (
@@ -33,6 +35,8 @@ from sofnn_torch.learners.learner import Learner
 from sofnn_torch.maze.odometry import motion
 
 if TYPE_CHECKING:
+    from matplotlib.typing import RcKeyType
+
     from sofnn_torch.maze.robot import MazePlan
     from sofnn_torch.runs.trial import Trajectory
 
@@ -41,7 +45,7 @@ PURPLE, SKY, BLACK = "#CC79A7", "#56B4E9", "#000000"
 SERIES = [(BLUE, "-"), (VERMILION, "--"), (GREEN, "-."), (PURPLE, ":"), (BLACK, (0, (5, 1, 1, 1)))]
 DEPTHS = LinearSegmentedColormap.from_list("depths", ["white", SKY, "#409CD8"])  # low to high value
 TURNS = LinearSegmentedColormap.from_list("turns", [BLUE, BLACK, ORANGE])  # right, straight, left
-STYLE = {
+STYLE: "dict[RcKeyType, Any]" = {
     "font.size": 9,
     "axes.titlesize": 9,
     "axes.labelsize": 9,
@@ -66,8 +70,8 @@ def canvas(
 
     Without `tight` it has fixed margins, which is twice as fast.
     """
-    layout = "compressed" if tight else "none"
-    figure = Figure(figsize=(columns * width, height), layout=layout)
+    figure = Figure(figsize=(columns * width, height))
+    figure.set_layout_engine("compressed" if tight else "none")
     return figure, [figure.add_subplot(1, columns, i + 1) for i in range(columns)]
 
 
@@ -113,7 +117,7 @@ def bounds(plan: "MazePlan") -> tuple[float, float, float, float]:
 
 
 def _spot(
-    ax: Axes, centre: Sequence[float], radius: float, colour: str, line: Any, text: str
+    ax: Axes, centre: tuple[float, float], radius: float, colour: str, line: Any, text: str
 ) -> None:
     fill = Circle(centre, radius, facecolor=colour, alpha=0.12, linewidth=0, zorder=1)
     edge = Circle(centre, radius, fill=False, edgecolor=colour, linestyle=line, zorder=3)
@@ -151,25 +155,27 @@ def trajectory(plan: "MazePlan", path: "Trajectory", ax: Axes) -> None:
 def _headings(ax: Axes, poses: NDArray[Any], length: float, **style: Any) -> LineCollection:
     """A short line at each pose (T, 3) towards its heading."""
     ends = poses[:, :2] + length * np.column_stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])])
-    lines = LineCollection(np.stack([poses[:, :2], ends], 1), **style)
+    lines = LineCollection(list(np.stack([poses[:, :2], ends], 1)), **style)
     ax.add_collection(lines, autolim=False)
     return lines
 
 
-def _legend_above(ax: Axes) -> None:
-    ax.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=4, borderaxespad=0.2, handlelength=2.2)
+def _legend_above(ax: Axes) -> Legend:
+    return ax.legend(
+        loc="lower left", bbox_to_anchor=(0, 1), ncols=4, borderaxespad=0.2, handlelength=2.2
+    )
 
 
-def _turn_legend(ax: Axes, symbol: str) -> None:
+def _turn_legend(ax: Axes, symbol: str) -> Legend:
     for colour, name in ((BLUE, "right turn"), (BLACK, "straight"), (ORANGE, "left turn")):
         ax.plot([], [], symbol, color=colour, markersize=4, label=name)
-    _legend_above(ax)
+    return _legend_above(ax)
 
 
 @styled
 def rule_map(
     plan: "MazePlan", agent: Learner, ax: Axes, weights: NDArray[Any] | None = None
-) -> None:
+) -> Legend:
     """Every rule at its centre, a tick towards its heading, coloured by the action there.
 
     Args:
@@ -177,6 +183,9 @@ def rule_map(
         agent: the learner.
         ax: where to draw.
         weights: a use of each rule (`usage`), which sets the size of its dot. Shape: (K,).
+
+    Returns:
+        The legend of the colours.
     """
     maze_plan(plan, ax, labels=False)
     centres = agent.net.centres[:, :3].double().numpy()
@@ -186,8 +195,9 @@ def rule_map(
     if weights is not None:
         sizes = 2 + 18 * np.sqrt(weights / max(weights.max(), 1e-12))
     _headings(ax, centres, 0.02, colors=colours, linewidths=0.7, zorder=4)
-    ax.scatter(*centres[:, :2].T, s=sizes, c=colours, alpha=0.75, linewidths=0, zorder=4)
-    _turn_legend(ax, "o")
+    x, y = centres[:, :2].T
+    ax.scatter(x, y, s=sizes, c=colours, alpha=0.75, linewidths=0, zorder=4)
+    return _turn_legend(ax, "o")
 
 
 @styled
@@ -242,26 +252,32 @@ def rules(
     inputs = agent.net.n_inputs
     cells = figure.add_gridspec(inputs, 2, width_ratios=[1.2, 1])
     ax = figure.add_subplot(cells[:, 0])
-    rule_map(plan, agent, ax, weights)
-    ax.get_legend().set_title("all rules together, at each centre", {"size": 8})
-    ax.get_legend().set_alignment("left")
+    legend = rule_map(plan, agent, ax, weights)
+    legend.set_title("all rules together, at each centre", FontProperties(size=8))
+    legend.set_alignment("left")
     best = np.argsort(-weights, kind="stable")[: len(SERIES)].tolist()
     names = {rule: f"rule {rule + 1}: {texts[rule]}" for rule in best}
     for rule in best:
-        at = agent.net.centres[rule, :2].tolist()
-        ax.add_patch(Circle(at, 0.02, fill=False, edgecolor=PURPLE, linewidth=1.4, zorder=7))
+        x, y = agent.net.centres[rule, :2].tolist()
+        ax.add_patch(Circle((x, y), 0.02, fill=False, edgecolor=PURPLE, linewidth=1.4, zorder=7))
         halo = [withStroke(linewidth=2, foreground="white")]
-        _note(ax, str(rule + 1), at, 7, ha="center", path_effects=halo, zorder=7)
+        _note(ax, str(rule + 1), (x, y), 7, ha="center", path_effects=halo, zorder=7)
     for i in range(inputs):
         ax = figure.add_subplot(cells[i, 1])
         memberships(agent, i, ax, names)
         if i == inputs // 2:
             ax.set_ylabel("membership")
         if i == 0:
-            place = {"loc": "lower left", "bbox_to_anchor": (-0.04, 1), "alignment": "left"}
-            spaces = {"ncols": 2, "handlelength": 2, "columnspacing": 1, "handletextpad": 0.5}
             ax.legend(
-                title="rules that fire most, each by itself", title_fontsize=8, **place, **spaces
+                title="rules that fire most, each by itself",
+                title_fontsize=8,
+                loc="lower left",
+                bbox_to_anchor=(-0.04, 1),
+                alignment="left",
+                ncols=2,
+                handlelength=2,
+                columnspacing=1,
+                handletextpad=0.5,
             )
     return figure
 
@@ -303,7 +319,8 @@ def action_field(
     colours = TURNS(Normalize(-1, 1)(turn))
     forward, turn = np.clip(forward, 0, 1)[:, None], turn[:, None]
     end = begin + 0.24 * step * (forward * ahead + turn * aside)
-    spokes = LineCollection(np.stack([begin, end], 1), colors=colours, linewidths=0.8, zorder=4)
+    lines = list(np.stack([begin, end], 1))
+    spokes = LineCollection(lines, colors=colours, linewidths=0.8, zorder=4)
     ax.add_collection(spokes, autolim=False)
     mean = (forward * ahead).reshape(-1, headings, 2).mean(1)
     length = np.hypot(*mean.T)
@@ -396,7 +413,7 @@ def learning_curves(
         length = min(map(len, curves))
         table, trials = np.array([c[:length] for c in curves]), np.arange(1, length + 1)
         for curve in curves if len(curves) > 1 else ():
-            single = {"color": colour, "linewidth": 0.4, "alpha": 0.3, "zorder": 2}
+            single: dict[str, Any] = {"color": colour, "linewidth": 0.4, "alpha": 0.3, "zorder": 2}
             ax.plot(np.arange(1, len(curve) + 1), curve, **single)
         low, median, high = np.quantile(table, [0.25, 0.5, 0.75], axis=0)
         ax.fill_between(trials, low, high, color=colour, alpha=0.2, linewidth=0, zorder=3)
@@ -421,8 +438,9 @@ def pose_error(path: "Trajectory", ax: Axes, plan: "MazePlan | None" = None) -> 
     """Distance between true and estimated position along a trial, sub-goals shaded."""
     error = 1000 * np.hypot(*(path.true - path.estimated)[:, :2].T)
     before = -math.inf
-    for number, centre in enumerate(plan.subgoals if plan else [], 1):
-        inside = np.hypot(*(path.true[:, :2] - centre).T) < plan.subgoal_radius
+    subgoals, radius = (plan.subgoals, plan.subgoal_radius) if plan else ([], 0.0)
+    for number, centre in enumerate(subgoals, 1):
+        inside = np.hypot(*(path.true[:, :2] - centre).T) < radius
         edges = np.flatnonzero(np.diff(inside, prepend=False, append=False)).reshape(-1, 2)
         for first, last in edges:
             ax.axvspan(first - 0.5, last - 0.5, color="0.88", zorder=0)

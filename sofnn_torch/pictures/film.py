@@ -20,7 +20,7 @@ from sofnn_torch.learners.learner import Learner
 from sofnn_torch.maze.rendering import OffscreenRenderer
 from sofnn_torch.maze.robot import load_model
 from sofnn_torch.runs import seeding
-from sofnn_torch.runs.factory import make_env
+from sofnn_torch.runs.factory import make_maze, make_task
 from sofnn_torch.runs.settings import MAZE, Config
 
 
@@ -44,7 +44,7 @@ def task_film(
     config: Config, agent: Learner, seed: int = 0, explore: bool = False, limit: int = 20_000
 ) -> Iterator[NDArray[np.uint8]]:
     """Frames as the environment draws them, one for each step."""
-    env = make_env(config, "rgb_array")
+    env = make_task(config, "rgb_array")
     rng = agent.rng  # a film must not change the training
     try:
         seeding.begin(env, agent, seed)
@@ -83,8 +83,8 @@ def maze_film(
     Raises:
         RenderingError: this machine cannot draw.
     """
-    env = make_env(config)
-    renderer = OffscreenRenderer(load_model(env.unwrapped.model_path), size, size)
+    env = make_maze(config)
+    renderer = OffscreenRenderer(load_model(env.model_path), size, size)
     for effect in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
         renderer.scene.flags[effect] = 0  # four fifths of the time where there is no GPU
     trail: list[tuple[float, float]] = []
@@ -152,7 +152,8 @@ def mp4(frames: Iterator[NDArray[np.uint8]], frames_per_second: int = 30) -> byt
         except (OSError, RuntimeError) as error:
             raise OSError(f"no film: ffmpeg cannot be started ({error})") from None
         try:
-            with contextlib.suppress(BrokenPipeError), encoder.stdin as pipe:
+            # The stubs do not know that there is a pipe.
+            with contextlib.suppress(BrokenPipeError), encoder.stdin as pipe:  # type: ignore[union-attr]
                 for frame in itertools.chain([first], frames):
                     pipe.write(frame.tobytes())
         finally:

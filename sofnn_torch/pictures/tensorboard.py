@@ -6,6 +6,7 @@ stops a training: what cannot be written or drawn is said once and left out.
 """
 
 import dataclasses
+import functools
 import gc
 import io
 from collections import deque
@@ -14,17 +15,19 @@ from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
+from matplotlib.axes import Axes
 from numpy.typing import NDArray
 from PIL import Image
 from tensorboard.compat.proto.summary_pb2 import Summary
 from torch.utils.tensorboard.summary import hparams
 
 from sofnn_torch.learners.learner import Learner
+from sofnn_torch.maze.robot import MazePlan
 from sofnn_torch.pictures import figures
 from sofnn_torch.pictures.events import EventFile
 from sofnn_torch.pictures.film import film, gif
 from sofnn_torch.runs.directory import flatten
-from sofnn_torch.runs.factory import make_env
+from sofnn_torch.runs.factory import make_plan
 from sofnn_torch.runs.settings import MAZE, Config
 from sofnn_torch.runs.trial import Trajectory, TrialRecord
 from sofnn_torch.terminal import say
@@ -62,7 +65,6 @@ class Monitor:
         self.run_dir, self.config = Path(run_dir), config
         self.picture_every, self.video_every = picture_every, video_every
         self.successes: deque[float] = deque(self._earlier_successes(first_trial), maxlen=WINDOW)
-        self._plan = None
         self._broken: set[str] = set()
         self._warned = False
         self._events: EventFile | None = None
@@ -98,7 +100,7 @@ class Monitor:
             self._guard("TensorBoard", self._events.close)
             self._events = None
 
-    def _guard(self, part: str, action: Callable[[], None]) -> None:
+    def _guard(self, part: str, action: Callable[[], object]) -> None:
         """Run an action; say a failure once and go on without, or try again if it is the disk."""
         if part in self._broken:
             return
@@ -117,11 +119,12 @@ class Monitor:
             reason = " ".join(str(error).split()) or type(error).__name__
             say(f"warning: no {part} from now on, training goes on ({reason})")
 
-    def _open(self, trial: int) -> None:
-        self._events = EventFile(self.run_dir, trial)
-        self._hparams()
+    def _open(self, trial: int) -> EventFile:
+        self._events = events = EventFile(self.run_dir, trial)
+        self._hparams(events)
+        return events
 
-    def _hparams(self) -> None:
+    def _hparams(self, events: EventFile) -> None:
         """Write the settings into this run; torch's `add_hparams` would make a second."""
         settings = flatten(dataclasses.asdict(self.config))
         plain = {
@@ -129,12 +132,13 @@ class Monitor:
             for name, value in settings.items()
         }
         for summary in hparams(plain, dict.fromkeys(HPARAM_METRICS)):
-            self._events.add(summary)
+            events.add(summary)
 
     def _scalars(self, record: TrialRecord, steps_per_second: float) -> None:
-        if self._events is None or not self._events.path.exists():  # the disk failed, or deleted
-            self._open(record.trial)
-        values = {
+        events = self._events
+        if events is None or not events.path.exists():  # the disk failed, or deleted
+            events = self._open(record.trial)
+        values: dict[str, float] = {
             "trial/steps": record.steps,
             "trial/decisions": record.decisions,
             "trial/return": record.reward,
@@ -149,16 +153,16 @@ class Monitor:
         scalars = [
             Summary.Value(tag=k, simple_value=v) for k, v in (values | record.statistics).items()
         ]
-        self._events.add(Summary(value=scalars), record.trial)
-        self._events.flush()
+        events.add(Summary(value=scalars), record.trial)
+        events.flush()
+
+    @functools.cached_property
+    def _plan(self) -> MazePlan:
+        return make_plan(self.config)
 
     def _pictures(self, trial: int, path: Trajectory, agent: Learner) -> None:
-        if self._plan is None:
-            env = make_env(self.config)
-            self._plan = env.unwrapped.plan
-            env.close()
         plan, states = self._plan, path.decided_at(self.config.pose)
-        drawings = {
+        drawings: dict[str, Callable[[Axes], object]] = {
             "trajectory": lambda ax: figures.trajectory(plan, path, ax),
             "rules": lambda ax: figures.rule_map(plan, agent, ax, agent.usage(states)),
             "policy": lambda ax: figures.action_field(plan, agent, ax),

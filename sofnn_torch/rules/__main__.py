@@ -12,7 +12,7 @@ import json
 import math
 import shutil
 import signal
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -36,7 +36,7 @@ from sofnn_torch.rules import files, words
 from sofnn_torch.rules.words import Decision, Reading, number
 from sofnn_torch.runs import checkpoint, seeding
 from sofnn_torch.runs.directory import Run
-from sofnn_torch.runs.factory import make_env
+from sofnn_torch.runs.factory import make_env, make_plan
 from sofnn_torch.runs.places import numbered
 from sofnn_torch.runs.session import RunOptions, arithmetic, home_of
 from sofnn_torch.runs.settings import MAZE, Config
@@ -150,7 +150,7 @@ def decision_table(reading: Reading, decision: Decision, by_action: bool) -> Tab
         by_action: rules fire differently for each action.
     """
     shares, worth = decision.shares, decision.shares * decision.conclusions
-    columns = range(len(decision.names))
+    columns: Sequence[int] = range(len(decision.names))
     if len(columns) > words.MANY:
         columns = [int(decision.outputs.argmax())]
     view = _headed(reading, [decision.names[j] for j in columns])
@@ -177,8 +177,8 @@ def decision_table(reading: Reading, decision: Decision, by_action: bool) -> Tab
 
 
 def _headed(reading: Reading, consequents: Iterable[str]) -> Table:
-    heads = [name.partition(", ") for name in reading.antecedents]
-    heads = [f"{name}\nis about\n{unit}".strip() for name, _, unit in heads]
+    named = [name.partition(", ") for name in reading.antecedents]
+    heads = [f"{name}\nis about\n{unit}".strip() for name, _, unit in named]
     first, *others = [name.replace(" ", "\n") for name in consequents]
     heads = [f"IF {heads[0]}", *(f"AND {head}" for head in heads[1:]), f"THEN {first}", *others]
     view = Table("rule", "share", *heads, box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
@@ -212,9 +212,7 @@ def state_of(options: Options, config: Config) -> NDArray[np.float32]:
         names = ", ".join(axis.name for axis in axes)
         raise ValueError(f"--at needs {len(axes)} numbers ({names}), got {len(values)}")
     if config.env == MAZE:
-        env = make_env(config)
-        width, height = env.unwrapped.plan.size
-        env.close()
+        width, height = make_plan(config).size
         x, y, degrees = values
         if not (0 <= x <= width and 0 <= y <= height):
             say(f"warning: --at {x:g} {y:g} is outside the maze of {width:g} x {height:g} m")
@@ -228,15 +226,20 @@ def state_of(options: Options, config: Config) -> NDArray[np.float32]:
 
 
 def edit(
-    options: Options, config: Config, agent: Learner, path: Path, state: dict[str, Any]
+    options: Options,
+    file: Path,
+    config: Config,
+    agent: Learner,
+    path: Path,
+    state: dict[str, Any],
 ) -> Path:
-    """Make a run with other rules and the rest of a state; its directory.
+    """Make a run with the rules in a file and the rest of a state; its directory.
 
     Raises:
         ValueError: rules that the run cannot have, or a directory that cannot be written; nothing
             is left behind then.
     """
-    rules = torch.from_numpy(files.read(options.load, files.schema(agent)))
+    rules = torch.from_numpy(files.read(file, files.schema(agent)))
     agent.net.replace_rules(*rules.split_with_sizes(agent.net.parts, 1))
     # The best and the last ten trials were those of other rules.
     state = state | {"network": checkpoint.describe(agent.net), "recent": [], "best": []}
@@ -249,7 +252,7 @@ def edit(
     places = [home.with_name(options.name)] if options.name else usual
     before = json.loads((home / "config.json").read_bytes())
     session = {"versions": before.get("versions"), "commit": before.get("commit")}
-    session["edited"] = {"checkpoint": str(path), "rules": str(options.load)}
+    session["edited"] = {"checkpoint": str(path), "rules": str(file)}
     earlier = [*before.get("earlier", []), session]
     with Run.create(places, config, RunOptions.keep, earlier) as run:
         if (trials := home / "trials.csv").exists():
@@ -275,9 +278,7 @@ def write(options: Options, config: Config, agent: Learner, reading: Reading, sh
     if options.csv:
         checkpoint.write_atomically(options.csv, files.to_csv(kind, parameters, comments))
     if options.picture:
-        env = make_env(config)
-        figure = figures.rules(env.unwrapped.plan, agent, shares, reading.brief())
-        env.close()
+        figure = figures.rules(make_plan(config), agent, shares, reading.brief())
         data = figures.saved(figure, options.picture.suffix[1:])
         checkpoint.write_atomically(options.picture, data)
 
@@ -295,15 +296,15 @@ def run(options: Options) -> None:
     if options.picture and config.env != MAZE:
         raise ValueError(f"--picture is for the maze, not for --env {config.env}")
     if options.load:
-        new, rules = edit(options, config, agent, path, state), agent.net.n_rules
+        new, rules = edit(options, options.load, config, agent, path, state), agent.net.n_rules
         print(f"{new}: {plural(rules, 'rule')} from {options.load}, the rest from {path}")
         return
     print(learned(agent, path, state))
     reading = words.read(agent)
     if options.at:
-        state = state_of(options, config)
-        decision = words.decide(agent, state)
-        place = map(words.at, config.task.axes, state.tolist())
+        asked = state_of(options, config)
+        decision = words.decide(agent, asked)
+        place = map(words.at, config.task.axes, asked.tolist())
         print(f"at {', '.join(place)}:")
         show(decision_table(reading, decision, len(agent.inputs) > len(agent.task.axes)))
         print(f"action: {decision.action}")

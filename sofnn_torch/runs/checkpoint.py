@@ -25,13 +25,16 @@ from typing import Any
 
 import torch
 
+from sofnn_torch.learners.learner import Learner
+from sofnn_torch.network.sofnn import SOFNN
+
 VERSION = 2
 HEADER = re.compile(rb"sofnn-torch checkpoint (\d{1,9}) ([0-9a-f]{64})\n")
 HEADER_SIZE = 200  # no header line is longer
 LARGEST = 2**30  # bytes of a file; a million rules take less
 # What a payload is made of; torch would read more, some of which takes memory as it likes.
 BUILT_OF = re.compile(r"torch \w+Storage|torch\._utils _rebuild_tensor_v2|collections OrderedDict")
-NAME = re.compile(r"checkpoint-(\d+)\.pt")
+NAME = re.compile(r"checkpoint-\d+\.pt")
 ADVICE = "; use an earlier checkpoint"
 KINDS = {
     "config": dict,
@@ -80,7 +83,7 @@ def load(path: Path) -> dict[str, Any]:
     return state
 
 
-def restore(path: Path, state: dict[str, Any], agent, env) -> None:
+def restore(path: Path, state: dict[str, Any], agent: Learner, env: Any) -> None:
     """Put a loaded state into an agent and an environment made from the same settings.
 
     Raises:
@@ -121,7 +124,7 @@ def _misfit(expected: Any, found: Any, name: str = "state") -> str:
     return ""
 
 
-def describe(net) -> dict[str, Any]:
+def describe(net: SOFNN) -> dict[str, Any]:
     """Constructor arguments and size of a network, to check a state against."""
     return {
         "n_inputs": net.n_inputs,
@@ -134,7 +137,7 @@ def describe(net) -> dict[str, Any]:
     }
 
 
-def snapshot(agent, env) -> dict[str, Any]:
+def snapshot(agent: Learner, env: Any) -> dict[str, Any]:
     """A copy of all that the future of agent and env depends on."""
     # state_dict() of a module refers to the live parameters.
     return {
@@ -152,7 +155,7 @@ def checkpoints(directory: Path) -> list[Path]:
 
 def number(path: Path) -> int:
     """The trial in the name of a numbered checkpoint."""
-    return int(NAME.fullmatch(path.name)[1])
+    return int(path.stem.removeprefix("checkpoint-"))
 
 
 def find_latest(
@@ -167,7 +170,7 @@ def find_latest(
     Raises:
         CheckpointError: there is none.
     """
-    problems = []
+    problems: list[str] = []
     for path in checkpoints(directory):
         try:
             state = load(path)

@@ -199,7 +199,7 @@ class Run:
             self._anchor = None
 
     @contextlib.contextmanager
-    def _forgiving(self, what: str):
+    def _forgiving(self, what: str) -> Iterator[None]:
         """Training outlives a disk that refuses: warn once, the next trial tries again."""
         try:
             if not self._is_ours():
@@ -228,10 +228,12 @@ class Run:
 
     def _is_ours(self) -> bool:
         """The directory is still the one that this process took, not a later one of that name."""
+        if self._anchor is None:
+            return False
         try:
             lock, settings = os.stat(self.path / "run.lock"), self.path / "config.json"
             return os.path.samestat(lock, os.fstat(self._anchor)) and settings.exists()
-        except (OSError, TypeError):
+        except OSError:
             return False
 
     def _remake(self) -> None:

@@ -85,7 +85,7 @@ def farthest(axis: Axis) -> float:
     return max(FARTHEST, *(10 * end for end in ends))
 
 
-def physics_warnings(env) -> str:
+def physics_warnings(env: Any) -> str:
     """MuJoCo's warnings since the last reset that make a simulation worthless; empty if none."""
     physics = getattr(env.unwrapped, "physics", None)
     if physics is None:

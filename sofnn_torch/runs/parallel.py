@@ -9,8 +9,9 @@ import dataclasses
 import os
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 from joblib import Parallel, delayed
 
@@ -41,7 +42,7 @@ def train(
     configs = [dataclasses.replace(config, seed=number) for number in parse(listed)]
     common = [sys.executable, "-m", "sofnn_torch.cli", *_without(argv, OWN), "--quiet"]
 
-    def jobs():
+    def jobs() -> Iterator[Any]:
         for each in configs:  # a name is taken when the turn of its seed has come
             number, name = each.seed, options.name and f"{options.name}-s{each.seed}"
             path = places.reserve(options.runs / (name or places.default_name(each)))

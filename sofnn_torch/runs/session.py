@@ -11,11 +11,10 @@ import torch
 
 from sofnn_torch.bounds import Count, Settings, Within
 from sofnn_torch.learners.learner import Learner
-from sofnn_torch.maze.env import KheperaMazeEnv
 from sofnn_torch.runs import checkpoint, places
 from sofnn_torch.runs.checkpoint import CheckpointError
 from sofnn_torch.runs.directory import Run, load_config, same_settings
-from sofnn_torch.runs.factory import make_agent, make_env
+from sofnn_torch.runs.factory import Environment, make_agent, make_env
 from sofnn_torch.runs.provenance import make_portable
 from sofnn_torch.runs.seeding import stream
 from sofnn_torch.runs.settings import Config, from_dict
@@ -76,7 +75,7 @@ class Session:
 
     run: Run
     agent: Learner
-    env: KheperaMazeEnv
+    env: Environment
     state: dict[str, Any]
 
     @property
@@ -208,8 +207,8 @@ def _create(config: Config, options: RunOptions, state: dict[str, Any]) -> Run:
     return run
 
 
-def build(config: Config) -> tuple[Learner, KheperaMazeEnv]:
-    """Learner and maze with their own random numbers.
+def build(config: Config) -> tuple[Learner, Environment]:
+    """Learner and environment with their own random numbers.
 
     Raises:
         ValueError: settings that do not go together.
@@ -237,8 +236,8 @@ def home_of(path: Path) -> Path | None:
     return path.parent if (path.parent / "config.json").exists() else None
 
 
-def _choose(home: Path, path: Path, config: Config) -> tuple[Path | None, dict[str, Any] | None]:
-    """The checkpoint to go on from; (None, None) if no trial was ever finished."""
+def _choose(home: Path, path: Path, config: Config) -> tuple[Path, dict[str, Any] | None]:
+    """The checkpoint to go on from and its state; None if no trial was ever finished."""
 
     def check(file: Path, state: dict[str, Any]) -> None:
         same_settings(file, state, config)
@@ -249,7 +248,7 @@ def _choose(home: Path, path: Path, config: Config) -> tuple[Path | None, dict[s
         check(path, state)
         return path, state
     if not checkpoint.checkpoints(home) and not (home / "trials.csv").exists():
-        return None, None
+        return path, None
     file, state, problems = checkpoint.find_latest(home, check)
     if problems:
         raise CheckpointError(
@@ -258,6 +257,6 @@ def _choose(home: Path, path: Path, config: Config) -> tuple[Path | None, dict[s
     return file, state
 
 
-def _first_state(config: Config, agent: Learner, env: KheperaMazeEnv) -> dict[str, Any]:
+def _first_state(config: Config, agent: Learner, env: Environment) -> dict[str, Any]:
     counters = {"trial": 0, "total_steps": 0, "recent": [], "best": []}
     return {"config": dataclasses.asdict(config)} | counters | checkpoint.snapshot(agent, env)

@@ -9,7 +9,7 @@ import dataclasses
 import io
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable
 from pathlib import Path
 
 from sofnn_torch.progress import say
@@ -82,17 +82,17 @@ def take(file: Path, trial: int, trials: int) -> list[str]:
     return [*lines[:1], *known]
 
 
-def line(cells: Sequence[object]) -> str:
+def line(cells: Iterable[object]) -> str:
     """A line of the table."""
     buffer = io.StringIO()
     csv.writer(buffer, lineterminator="\n").writerow(cells)
     return buffer.getvalue()
 
 
-def number(row: str) -> int | None:
-    """The trial of a line; None if it has none."""
+def number(row: str) -> int:
+    """The trial of a line, from 1; 0 if it has none."""
     first = row.partition(",")[0]
-    return int(first) if first.isdecimal() and len(first) < 20 else None
+    return int(first) if first.isdecimal() and len(first) < 20 else 0
 
 
 def _foreign(text: str) -> tuple[list[str], str]:

@@ -13,7 +13,7 @@ import dataclasses
 import signal
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 if __name__ == "__main__":  # Ctrl-C while libraries load: there is nothing to save yet
     signal.signal(signal.SIGINT, signal.SIG_DFL)
@@ -55,15 +55,29 @@ class Options(Settings):
     """Run nothing: tables and figures from the data that is there."""
 
 
-def complete(options: Options) -> Options:
+@dataclass(frozen=True)
+class Complete(Options):
+    """Options of which none is left open."""
+
+    seeds: str = "0-9"
+    out: Path = Path("docs/results")
+    runs: Path = Path("runs/studies")
+
+
+QUICK = Complete(
+    seeds="0-1",
+    trials=30,
+    max_steps=3000,
+    out=Path("runs/quick/results"),
+    runs=Path("runs/quick"),
+)
+
+
+def complete(options: Options) -> Complete:
     """The options with everything that was left open."""
-    usual = {"seeds": "0-9", "out": Path("docs/results"), "runs": Path("runs/studies")}
-    if options.quick:
-        home = Path("runs/quick")
-        usual = {"seeds": "0-1", "out": home / "results", "runs": home}
-        usual |= {"trials": 30, "max_steps": 3000}
-    unset = {name: value for name, value in usual.items() if getattr(options, name) is None}
-    return dataclasses.replace(options, **unset)
+    values: dict[str, Any] = vars(options)
+    given = {name: value for name, value in values.items() if value is not None}
+    return dataclasses.replace(QUICK if options.quick else Complete(), **given)
 
 
 def variations(options: Options) -> dict[str, int]:
@@ -91,19 +105,19 @@ def run(options: Options) -> int:
         ValueError: options that fit nothing.
         Interrupted: by a signal, after saving.
     """
-    options = complete(options)
-    if options.report_only:
-        return report.write(options.out)
-    numbers, changes = parallel.parse(options.seeds), variations(options)
-    jobs = running.plan(options.runs, options.study, options.arms, numbers, changes)
+    asked = complete(options)
+    if asked.report_only:
+        return report.write(asked.out)
+    numbers, changes = parallel.parse(asked.seeds), variations(asked)
+    jobs = running.plan(asked.runs, asked.study, asked.arms, numbers, changes)
     if not jobs:
-        raise ValueError(f"--arms {options.arms}: no arm of {', '.join(options.study)} has that")
-    failed = running.execute(jobs, options.workers)
+        raise ValueError(f"--arms {asked.arms}: no arm of {', '.join(asked.study)} has that")
+    failed = running.execute(jobs, asked.workers)
     optimum = optimal_steps(Physics().plan).steps
-    for name in options.study:
-        notes = {"command": command(name, options), "quick": options.quick, "optimum": optimum}
-        collecting.collect(name, options.runs, options.out, changes, notes)
-    report.write(options.out)
+    for name in asked.study:
+        notes = {"command": command(name, asked), "quick": asked.quick, "optimum": optimum}
+        collecting.collect(name, asked.runs, asked.out, changes, notes)
+    report.write(asked.out)
     return 1 if failed else 0
 
 

@@ -155,9 +155,9 @@ def closing_table(data: Data) -> Iterator[tuple[str, ...]]:
                 yield text, str(steps), here, cell(ours, 3, 1 / optimum)
         for network, count in zip(("sofnn", "fixed"), rules, strict=True):
             if (arm := f"{agent}-{network}-estimated") in data.info["arms"]:
-                ours = data.remark(cell(median(data.column(arm, "rules"))), arm)
+                here = data.remark(cell(median(data.column(arm, "rules"))), arm)
                 printed = f"{count:,}" + r" \*" * (network == "fixed")
-                yield f"{title} with {NETWORKS[network]}: rules", printed, ours, ""
+                yield f"{title} with {NETWORKS[network]}: rules", printed, here, ""
 
 
 def goals(data: Data) -> Iterator[tuple[str, str, str, str]]:

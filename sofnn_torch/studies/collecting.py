@@ -36,7 +36,9 @@ def collect(
     The files are <study>.csv (a line for each run), <study>-curves.csv (steps and rules of each
     trial), <study>-paths.csv (the last trial), <study>-conditions.csv and <study>.json.
     """
-    study, tables = STUDIES[name], {"": [], "curves": [], "paths": [], "conditions": []}
+    study = STUDIES[name]
+    parts = ("", "curves", "paths", "conditions")
+    tables: dict[str, list[dict[str, Any]]] = {part: [] for part in parts}
     of_arm: dict[Config, list[tuple[int, Path]]] = {}
     for config, path in find_runs(parent).items():
         if (path / "evaluation.json").exists():
@@ -44,7 +46,7 @@ def collect(
             of_arm.setdefault(anonymous, []).append((config.seed, path))
     arms, spans, sources, played = {}, [], [], []
     for arm, entries in study.arms.items():
-        config = settings(entries | changes)
+        config = settings({**entries, **changes})
         found = sorted(of_arm.get(essence(config), []))
         if not found:
             continue

@@ -9,8 +9,9 @@ import gymnasium
 import numpy as np
 
 from sofnn_torch import evaluate
+from sofnn_torch.maze.env import KheperaMazeEnv
 from sofnn_torch.runs import seeding
-from sofnn_torch.runs.factory import make_env
+from sofnn_torch.runs.factory import make_maze
 from sofnn_torch.runs.settings import Config
 from sofnn_torch.training import play
 
@@ -33,21 +34,21 @@ CONDITIONS: dict[str, dict[float, dict[str, float]]] = {
 class ScatteredStart(gymnasium.Wrapper):
     """Begins every trial near the start, uniformly within `spread` times `START_SPREAD`."""
 
-    def __init__(self, env: gymnasium.Env, spread: float, seed: int):
+    def __init__(self, env: KheperaMazeEnv, spread: float, seed: int):
         super().__init__(env)
-        self.spread, self.rng = spread, np.random.default_rng(seeding.stream("start", seed))
+        self.start, self.spread = np.array(env.plan.start), spread
+        self.rng = np.random.default_rng(seeding.stream("start", seed))
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
         """Begin a trial; the robot is told where it stands, as at every pass of the start."""
         offset = self.spread * np.array(START_SPREAD) * self.rng.uniform(-1, 1, 3)
-        pose = np.array(self.env.unwrapped.plan.start) + offset
-        return self.env.reset(seed=seed, options={"pose": tuple(pose)})
+        return self.env.reset(seed=seed, options={"pose": tuple(self.start + offset)})
 
 
 def changed_maze(config: Config, change: dict[str, float], seed: int) -> gymnasium.Env:
     """The maze of a run with one condition changed."""
-    maze = {name: value for name, value in change.items() if name != "start"}
-    env = make_env(dataclasses.replace(config, maze=dataclasses.replace(config.maze, **maze)))
+    maze: dict[str, Any] = {name: value for name, value in change.items() if name != "start"}
+    env = make_maze(dataclasses.replace(config, maze=dataclasses.replace(config.maze, **maze)))
     return ScatteredStart(env, change["start"], seed) if change.get("start") else env
 
 

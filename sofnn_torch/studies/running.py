@@ -73,13 +73,14 @@ def plan(
         numbers: seeds.
         changes: settings that are changed in every arm.
     """
-    existing, jobs = find_runs(parent), {}
+    existing = find_runs(parent)
+    jobs: dict[Config, Job] = {}
     for name in studies:
         study, taken = STUDIES[name], {job.path for job in jobs.values()}
         for seed, (arm, entries) in itertools.product(numbers, study.arms.items()):
             if only not in arm:
                 continue
-            config = settings(entries | changes, seed)
+            config = settings({**entries, **changes}, seed)
             key = essence(config)
             if key in jobs:
                 conditions = jobs[key].conditions or study.conditions

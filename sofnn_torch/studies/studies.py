@@ -53,10 +53,11 @@ def _four(poses: tuple[str, ...], common: Arm) -> dict[str, Arm]:
 
 def _variants(common: dict[str, Arm], own: dict[str, dict[str, Arm]]) -> dict[str, Arm]:
     """For each learner its preset, then each change alone."""
+    preset: dict[str, Arm] = {"default": {}}
     return {
         f"{agent}-{name}": base | change
         for agent, base in LEARNERS.items()
-        for name, change in ({"default": {}} | own[agent] | common).items()
+        for name, change in (preset | own[agent] | common).items()
     }
 
 
@@ -221,14 +222,14 @@ def settings(arm: Arm, seed: int = 0, **changes: Any) -> Config:
         if isinstance(value, Times):
             value = value.factor * getattr(before, entry)
         tables.setdefault(table, {})[entry] = value
-    top = {"seed": seed} | tables.pop("", {})
+    top: Arm = {"seed": seed} | tables.pop("", {})
     parts = {name: dataclasses.replace(getattr(config, name), **t) for name, t in tables.items()}
     return dataclasses.replace(config, **top, **parts)
 
 
 def changed(arm: Arm) -> str:
     """What an arm changes against the preset that it starts from, as flags of ``train.py``."""
-    base = {k: arm[k] for k in ("agent", "network", "preset") if k in arm}
+    base: Arm = {k: arm[k] for k in ("agent", "network", "preset") if k in arm}
     before = flatten(dataclasses.asdict(settings(base)))
     after = flatten(dataclasses.asdict(settings(arm)))
     words = []

@@ -64,7 +64,7 @@ class TaskEnv(gymnasium.Env[NDArray[np.float32], Any]):
         found = spaces(env)
         self.env, self.metadata, self.render_mode = env, env.metadata, env.render_mode
         self.axes = tuple(axes or found.axes)
-        self.action_names, self._discrete = found.actions, found.discrete
+        self.action_names, self._acted = found.actions, _actions(env.action_space)
         if len(self.axes) != len(found.axes):
             raise ValueError(f"{len(found.axes)} inputs need as many axes, got {len(self.axes)}")
         free = [axis.period > 0 for axis in self.axes]
@@ -99,7 +99,7 @@ class TaskEnv(gymnasium.Env[NDArray[np.float32], Any]):
 
     def inner_action(self, action: Any) -> Any:
         """The action of the inner environment that an action of this one stands for."""
-        space = self.env.action_space
+        space = self._acted
         if isinstance(space, Discrete):
             return space.start + space.dtype.type(action)
         share = (np.asarray(action, np.float64).reshape(space.shape) + 1) / 2
@@ -185,20 +185,21 @@ def spaces(env: gymnasium.Env) -> Spaces:
     Raises:
         ValueError: one line on a kind of observation or action that is not supported.
     """
-    count = _inputs(env.observation_space)
-    number, discrete = _actions(env.action_space)
+    observed, acted = _observations(env.observation_space), _actions(env.action_space)
+    discrete = isinstance(acted, Discrete)
+    number = int(acted.n) if isinstance(acted, Discrete) else acted.low.size
     known = KNOWN.get(env.spec.name) if env.spec else None
-    if known and (len(known.axes), len(known.actions)) == (count, number):
+    if known and (len(known.axes), len(known.actions)) == (observed.low.size, number):
         return Spaces(known.axes, known.actions, discrete, known.reward_scale)
     names = tuple(f"action {j + 1}" for j in range(number)) if number > 1 else ("action",)
-    ends = (env.observation_space.low.ravel(), env.observation_space.high.ravel())
-    pairs = [_ends(float(low), float(high)) for low, high in zip(*ends, strict=True)]
+    ends = zip(observed.low.ravel(), observed.high.ravel(), strict=True)
+    pairs = [_ends(float(low), float(high)) for low, high in ends]
     axes = tuple(Axis(f"obs {i + 1}", "", low, high) for i, (low, high) in enumerate(pairs))
     return Spaces(axes, names, discrete)
 
 
-def _inputs(space: Space) -> int:
-    """How many numbers an observation has."""
+def _observations(space: Space) -> Box:
+    """The space of the observations, of a kind that is supported."""
     if not isinstance(space, Box):
         raise ValueError(f"observations must be a Box of numbers, not {type(space).__name__}")
     count = int(np.prod(space.shape))
@@ -209,22 +210,22 @@ def _inputs(space: Space) -> int:
         )
     if count == 0:
         raise ValueError("observations have no numbers")
-    return count
+    return space
 
 
-def _actions(space: Space) -> tuple[int, bool]:
-    """How many actions there are, or numbers in one, and whether one is chosen."""
+def _actions(space: Space) -> Box | Discrete:
+    """The space of the actions, of a kind that is supported."""
     if isinstance(space, Discrete):
         if not 1 <= space.n <= MOST_ACTIONS:
             raise ValueError(
                 f"at most {MOST_ACTIONS} discrete actions are supported, not {space.n}"
             )
-        return int(space.n), True
+        return space
     if not isinstance(space, Box) or np.prod(space.shape) == 0:
         raise ValueError(f"actions must be Discrete or a Box of numbers, not {space}")
     if not (space.is_bounded() and np.abs([space.low, space.high]).max() < ENDLESS):
         raise ValueError(f"actions must have a low and a high end, not {space}: bound them first")
-    return int(np.prod(space.shape)), False
+    return space
 
 
 def _ends(low: float, high: float) -> tuple[float, float]:

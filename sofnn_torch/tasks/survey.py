@@ -54,7 +54,8 @@ def play_at_random(env: TaskEnv, seed: int) -> tuple[np.ndarray, list[list[float
     """States (T, n) and the rewards of each trial, with actions drawn uniformly."""
     rng = np.random.default_rng(seed)
     space = env.action_space
-    states, trials = [env.reset(seed=seed)[0]], [[]]
+    states = [env.reset(seed=seed)[0]]
+    trials: list[list[float]] = [[]]
     for _ in range(STEPS):
         chosen = (
             rng.integers(space.n)
