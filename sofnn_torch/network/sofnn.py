@@ -50,6 +50,23 @@ class SOFNN(RuleTable):
 
     Raises:
         ValueError: a setting is out of range; the message says which and what to do.
+
+    Example:
+        Any optimizer of torch fits a function while the network grows (``examples/regression.py``):
+
+        >>> _ = torch.manual_seed(0)
+        >>> net = SOFNN(1, 1, width=0.1)
+        >>> optimizer = torch.optim.Adam(net.parameter_groups(consequents=0.1))
+        >>> net.follow(optimizer)
+        >>> for _ in range(200):
+        ...     x = torch.rand(16, 1)
+        ...     _ = net.grow(x[0])
+        ...     optimizer.zero_grad()
+        ...     loss = (net(x) - torch.sin(6 * x)).square().mean()
+        ...     loss.backward()
+        ...     optimizer.step()
+        >>> loss.item() < 0.01
+        True
     """
 
     def __init__(
@@ -119,19 +136,25 @@ class SOFNN(RuleTable):
         nearest ones where a product of memberships would underflow to 0 / 0.
 
         Args:
-            x: states, or one state (n,) for one row (K,).
+            x: states, or one state (n,) for one row (K,), of any type.
             antecedents: centres and widths, each (n, K); those of the network if None.
+
+        Raises:
+            ValueError: a state has another length, or the network has no rules.
         """
         centres, widths = antecedents or (self.part(0), self.part(1))
         x = self._states(x)
-        if x.dim() == 2 and len(x) >= batches.LARGE:
+        # Compiled or exported there is one way for any number of states.
+        if x.dim() == 2 and not torch.compiler.is_compiling() and len(x) >= batches.LARGE:
             if torch.is_autocast_enabled(x.device.type):  # what cancels needs all its digits
                 with torch.autocast(x.device.type, enabled=False):
                     return self.normalised_firing(x, (centres, widths))
             factors = batches.factors(centres, widths, self.wrapping)
             features = batches.features(x.to(factors), self.wrapping)
-            return batches.log_firing(features, factors, self.wrapping).softmax(-1).to(x)
-        return (-0.5 * self._squares(x, centres, widths).sum(-2)).softmax(-1)
+            log_firing = batches.log_firing(features, factors, self.wrapping)
+        else:
+            log_firing = -0.5 * self._squares(x, centres, widths).sum(-2)
+        return log_firing.softmax(-1).to(centres.dtype)
 
     def firing_functions(self) -> tuple[Callable[[Tensor], Tensor], Callable[[Tensor], Tensor]]:
         """The normalised firing in two steps, while the antecedents stay.
@@ -142,6 +165,7 @@ class SOFNN(RuleTable):
             A function from states (.., n) to their features (.., F), and one from features to the
             normalised firing (.., K).
         """
+        self._keep_widths()
         factors = batches.factors(self._centres, self._widths, self.wrapping)
 
         def features(x: Tensor) -> Tensor:
@@ -160,7 +184,7 @@ class SOFNN(RuleTable):
 
     def conclude(self, firing: Tensor) -> Tensor:
         """Outputs (m,) at a state whose normalised firing (K,) is known."""
-        return self._consequents @ firing
+        return self._consequents @ firing.to(self._consequents.dtype)
 
     def _squares(self, x: Tensor, centres: Tensor, widths: Tensor) -> Tensor:
         """((x - u) / v)^2 for x of shape (..., n). Shape: (..., n, K)."""
@@ -206,6 +230,7 @@ class SOFNN(RuleTable):
     def _grow(self, x: Tensor) -> Tensor:
         """Apply equation 3; the logarithm of every rule's firing strength at x. Shape: (K,)."""
         x = self._state(x)
+        self._keep_widths()
         squares = self._squares(x, self._centres, self._widths)
         log_firing = squares.sum(0).mul_(-0.5)
         best = log_firing.max().item()
@@ -214,26 +239,34 @@ class SOFNN(RuleTable):
         if place is None:
             return log_firing
         centre, width, labels = place
-        if not self.add_rule(centre, width, labels=labels, log_firing=log_firing):
+        here = centre is x
+        known = log_firing if here else None
+        if not self.add_rule(centre, width, labels=labels, log_firing=known):
             return log_firing
-        if place.centre is x:
+        if here:
             return torch.cat([log_firing, log_firing.new_zeros(1)])
         newest = self._squares(x, self._centres[:, -1:], self._widths[:, -1:])
         return torch.cat([log_firing, newest.sum(0).mul_(-0.5)])
 
     def _state(self, x: Tensor) -> Tensor:
-        """One state (n,) in the network's type."""
+        """One state (n,) in the type to compute with."""
         if x.shape != self.default_width.shape:
             raise ValueError(f"a state of {self.n_inputs} numbers is needed, got {tuple(x.shape)}")
-        return x if x.dtype == self.default_width.dtype else x.to(self.default_width)
+        return self._precise(x)
 
     def _states(self, x: Tensor) -> Tensor:
-        """States (.., n); of whole numbers or half precision in the network's type."""
+        """States (.., n) in the type to compute with."""
         if not 0 < x.dim() < 3 or x.shape[-1] != self.n_inputs:
             shape = tuple(x.shape)
             raise ValueError(f"states (B, {self.n_inputs}) are needed, got the shape {shape}")
-        precise = x.dtype in (torch.float32, torch.float64)
-        return x if precise else x.to(self.default_width.dtype)
+        return self._precise(x)
+
+    def _precise(self, x: Tensor) -> Tensor:
+        """States of any type in that of the network, but never in half precision."""
+        dtype = self.default_width.dtype
+        if x.dtype == dtype and dtype.itemsize > 2:
+            return x
+        return x.to(torch.promote_types(dtype, torch.float32))
 
     def add_rule(
         self,
