@@ -178,6 +178,8 @@ def test_a_network_in_half_precision_answers_nearly_like_one_in_single(count):
     answer = half(X[:count])
     assert answer.dtype == torch.half
     torch.testing.assert_close(answer.float(), brute(half, X[:count]).float(), rtol=0, atol=0.01)
+    far = half(torch.full((count, 3), 100.0))  # logarithms beyond the range of half precision
+    assert far.isfinite().all()
     assert half.observe(torch.full((3,), 5.0)).argmax() == 60  # and grows on
     assert half.conclude(half.observe(X[0])).isfinite().all()
 

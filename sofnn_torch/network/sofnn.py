@@ -154,7 +154,7 @@ class SOFNN(RuleTable):
             log_firing = batches.log_firing(features, factors, self.wrapping)
         else:
             log_firing = -0.5 * self._squares(x, centres, widths).sum(-2)
-        return log_firing.softmax(-1).to(centres.dtype)
+        return _normalised(log_firing, centres.dtype)
 
     def firing_functions(self) -> tuple[Callable[[Tensor], Tensor], Callable[[Tensor], Tensor]]:
         """The normalised firing in two steps, while the antecedents stay.
@@ -184,7 +184,7 @@ class SOFNN(RuleTable):
 
     def conclude(self, firing: Tensor) -> Tensor:
         """Outputs (m,) at a state whose normalised firing (K,) is known."""
-        return self._consequents @ firing.to(self._consequents.dtype)
+        return self._consequents @ firing
 
     def _squares(self, x: Tensor, centres: Tensor, widths: Tensor) -> Tensor:
         """((x - u) / v)^2 for x of shape (..., n). Shape: (..., n, K)."""
@@ -210,7 +210,7 @@ class SOFNN(RuleTable):
         """
         if self.n_rules == 0 and not self.grow(x):
             raise ValueError("the network has no rules and may add none: build it with grid()")
-        firing = self._grow(x).softmax(0)
+        firing = _normalised(self._grow(x), self._usage.dtype)
         self._usage.add_(firing)
         return firing
 
@@ -226,7 +226,6 @@ class SOFNN(RuleTable):
         self._grow(x)
         return self.n_rules > before
 
-    @torch.no_grad()
     def _grow(self, x: Tensor) -> Tensor:
         """Apply equation 3; the logarithm of every rule's firing strength at x. Shape: (K,)."""
         x = self._state(x)
@@ -249,10 +248,11 @@ class SOFNN(RuleTable):
         return torch.cat([log_firing, newest.sum(0).mul_(-0.5)])
 
     def _state(self, x: Tensor) -> Tensor:
-        """One state (n,) in the type to compute with."""
-        if x.shape != self.default_width.shape:
+        """One state (n,) in the type to compute with, without a gradient."""
+        if x.shape != (self.n_inputs,):
             raise ValueError(f"a state of {self.n_inputs} numbers is needed, got {tuple(x.shape)}")
-        return self._precise(x)
+        x = self._precise(x)
+        return x.detach() if x.requires_grad else x
 
     def _states(self, x: Tensor) -> Tensor:
         """States (.., n) in the type to compute with."""
@@ -263,7 +263,7 @@ class SOFNN(RuleTable):
 
     def _precise(self, x: Tensor) -> Tensor:
         """States of any type in that of the network, but never in half precision."""
-        dtype = self.default_width.dtype
+        dtype = self._usage.dtype
         if x.dtype == dtype and dtype.itemsize > 2:
             return x
         return x.to(torch.promote_types(dtype, torch.float32))
@@ -306,7 +306,7 @@ class SOFNN(RuleTable):
         if log_firing is None:
             firing = self.normalised_firing(centre, (self._centres, self._widths))
         else:
-            firing = log_firing.softmax(0)
+            firing = _normalised(log_firing, self._usage.dtype)
         return torch.where(self.interpolate, self.conclude(firing), self.initial)
 
     def replace_rules(self, centres: Tensor, widths: Tensor, consequents: Tensor) -> None:
@@ -335,6 +335,12 @@ class SOFNN(RuleTable):
             "rules/share_used": used,
             "rules/refused": float(self.refused),
         }
+
+
+def _normalised(log_firing: Tensor, dtype: torch.dtype) -> Tensor:
+    """Softmax in the type of the logarithms, which may be too large for another."""
+    firing = log_firing.softmax(-1)
+    return firing if firing.dtype == dtype else firing.to(dtype)
 
 
 def grid(axes: Sequence[Axis], shape: Sequence[int], n_outputs: int, **settings) -> SOFNN:

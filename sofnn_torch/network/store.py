@@ -11,7 +11,7 @@ table appends a block of each that is as large as all before it together.
 import copy
 from collections.abc import Mapping, Sequence
 from itertools import accumulate, pairwise
-from operator import is_
+from operator import attrgetter, is_
 from typing import Any, Self
 
 import torch
@@ -21,6 +21,7 @@ from sofnn_torch.network.optimizers import Followers
 from sofnn_torch.network.parameters import Blocks, Window
 
 KINDS = ("centres", "widths", "consequents")
+VERSION = attrgetter("_version")  # counts what is written in place
 STORES = ("table", "traces", "usage", "labels")
 COUNTED = ("traces", "usage", "labels")  # what has a column for each rule beside the parameters
 VIEWS = {"_active", "_active_parts", "_centres", "_widths", "_consequents", "_traces", "_usage"}
@@ -232,7 +233,7 @@ class RuleStore(nn.Module):
 
     def _written(self) -> int:
         """Changes whenever anything writes to the Parameters of the widths."""
-        return sum(window._version for window in self._windows[1])
+        return sum(map(VERSION, self._windows[1]))
 
     def _activate(self, n_rules: int) -> None:
         """Set the number of rules; the views of what belongs to them are made when next needed."""

@@ -88,8 +88,7 @@ class RuleTable(RuleStore):
         self._check_alone()
         if k == self.capacity:
             self._shape_blocks(self._sizes_for(k + 1))
-        for windows in self._windows:
-            self._followers.clear(windows[-1], k - self.capacity)
+        self._followers.clear([windows[-1] for windows in self._windows], k - self.capacity)
         self._store["table"].select(1, k).copy_(column.detach())
         if self.shared:
             fresh = self.labels.amax(1) + 1 if k else 0
