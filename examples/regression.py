@@ -3,7 +3,8 @@
     python examples/regression.py
 
 The optimizer is made before the first rule. It follows the network: each new rule is learned from
-the moment it is there, and what Adam remembers of the others stays with them.
+the moment it is there, and what Adam remembers of the others stays with them, also where rules are
+dropped.
 """
 
 import torch
@@ -24,17 +25,21 @@ def main() -> None:
     rates = net.parameter_groups(centres=1e-3, widths=1e-3, consequents=0.02)
     optimizer = torch.optim.Adam(rates)
     net.follow(optimizer)
-    for _ in range(600):
+    for step in range(600):
         x = torch.rand(64, 2)
-        for state in x[:4]:
-            net.grow(state)  # adds a rule where none fires by theta
+        for state in x[:4] if step < 400 else ():
+            net.observe(state)  # adds a rule where none fires by theta
+        if step == 400:
+            grown = net.n_rules
+            net.prune(net.usage > 0.4 * net.usage.median())  # those that hardly ever fired
         optimizer.zero_grad()
         (net(x) - target(x)).square().mean().backward()
         optimizer.step()
     x = torch.rand(2000, 2)
     with torch.no_grad():
         error = (net(x) - target(x)).square().mean().sqrt().item()
-    print(f"{net.n_rules} rules, rms error {error:.3f}, a constant {target(x).std().item():.3f}")
+    constant = target(x).std().item()
+    print(f"{grown} rules, {net.n_rules} kept, rms error {error:.3f}, a constant {constant:.3f}")
 
 
 if __name__ == "__main__":

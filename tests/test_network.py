@@ -239,6 +239,18 @@ def test_the_output_does_not_jump_where_a_rule_is_added(seed, theta):
         torch.testing.assert_close(net(x[None]), before, rtol=0, atol=1e-9)
 
 
+def test_a_rule_of_shared_functions_takes_the_output_at_its_own_centre():
+    net, added = network(growth="input", theta=0.5), 0
+    for k, x in enumerate(states(60)):
+        before = copy.deepcopy(net)
+        if net.grow(x) and k:
+            centre = net.centres[-1:]
+            torch.testing.assert_close(net.consequents[-1:], before(centre).detach())
+            added += bool((centre[0] != x).any())
+        net.consequents[-1].normal_(generator=torch.Generator().manual_seed(k))
+    assert added > 5
+
+
 def test_only_the_chosen_consequents_are_interpolated():
     net = network(initial=[5.0, 7.0], interpolate=[True, False])
     first = torch.tensor([0.1, 0.1, 0.0], dtype=torch.float64)
@@ -404,6 +416,7 @@ def test_the_cap_refuses_rules_and_counts():
         ({"width": math.nan}, "width"),
         ({"width": [0.1, 0.1]}, "width"),
         ({"growth": "wild"}, "growth"),
+        ({"growth": None}, "growth"),
         ({"max_rules": 0}, "max_rules"),
     ],
 )

@@ -1,6 +1,7 @@
 """The network under everything that torch lets one do to a Module, and under its optimizers."""
 
 import copy
+import doctest
 import io
 import pickle
 import runpy
@@ -12,6 +13,7 @@ from torch import nn
 from torch.nn.utils import parametrize, prune
 
 from sofnn_torch import SOFNN
+from sofnn_torch.network import sofnn
 
 X = torch.rand(40, 3, generator=torch.Generator().manual_seed(1))
 KINDS = ("centres", "widths", "consequents")
@@ -122,6 +124,35 @@ def test_states_can_be_mapped_over():
         torch.testing.assert_close(torch.vmap(net)(X), net(X), rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.parametrize("count", [8, 40])
+def test_an_ensemble_of_parameters_can_be_mapped_over(count):
+    nets, x = [grown(), grown()], X[:count]
+    nets[1].consequents.mul_(2)
+    nets[1].widths.mul_(1.5)
+    parameters, _ = torch.func.stack_module_state(nets)
+
+    def answer(given):
+        return torch.func.functional_call(nets[0], given, (x,))
+
+    expected = torch.stack([net(x) for net in nets])
+    torch.testing.assert_close(torch.func.vmap(answer)(parameters), expected, rtol=1e-4, atol=1e-4)
+
+
+def test_an_exported_network_answers_any_number_of_states():
+    net = grown()
+    batch = torch.export.Dim("batch", min=1, max=1000)
+    program = torch.export.export(net, (X[:8],), dynamic_shapes={"x": {0: batch}}).module()
+    for count in (1, 40):
+        torch.testing.assert_close(program(X[:count]), net(X[:count]), rtol=1e-4, atol=1e-4)
+
+
+def test_nothing_is_moved_to_a_device_without_memory():
+    net = grown()
+    with pytest.raises(ValueError, match="meta"):
+        net.to("meta")
+    agrees(net)
+
+
 def test_shared_memory_is_shared_and_grows_no_more():
     net = grown()
     net.share_memory()
@@ -129,6 +160,28 @@ def test_shared_memory_is_shared_and_grows_no_more():
     agrees(net)
     with pytest.raises(ValueError, match="share this network"):
         net.grow(torch.tensor([7.0, 7.0, 7.0]))
+
+
+@pytest.mark.parametrize("act", ["prune", "replace_rules"])
+def test_shared_rules_are_neither_dropped_nor_replaced(act):
+    net = grown().share_memory()
+    rules = [part.clone() for part in (net.centres, net.widths, net.consequents)]
+    with pytest.raises(ValueError, match="other processes"):
+        net.prune(torch.arange(60) > 9) if act == "prune" else net.replace_rules(*rules)
+    assert net.n_rules == 60
+
+
+@pytest.mark.parametrize("count", [8, 40])
+def test_a_network_in_half_precision_answers_nearly_like_one_in_single(count):
+    net = grown()
+    half = copy.deepcopy(net).half()
+    answer = half(X[:count])
+    assert answer.dtype == torch.half
+    torch.testing.assert_close(answer.float(), brute(half, X[:count]).float(), rtol=0, atol=0.01)
+    far = half(torch.full((count, 3), 100.0))  # logarithms beyond the range of half precision
+    assert far.isfinite().all()
+    assert half.observe(torch.full((3,), 5.0)).argmax() == 60  # and grows on
+    assert half.conclude(half.observe(X[0])).isfinite().all()
 
 
 @pytest.mark.parametrize("dtype", [torch.double, torch.half])
@@ -177,7 +230,7 @@ def test_a_state_of_another_width_of_outputs_is_refused():
 
 
 @pytest.mark.parametrize("count", [8, 40])
-@pytest.mark.parametrize("dtype", [torch.long, torch.half, torch.bfloat16])
+@pytest.mark.parametrize("dtype", [torch.long, torch.half, torch.bfloat16, torch.double])
 def test_states_of_any_type_are_answered_alike_one_by_one_and_in_batches(count, dtype):
     net, x = grown(), (X * 3).round()[:count]  # whole numbers are exact in every type
     torch.testing.assert_close(net(x.to(dtype)), net(x))
@@ -327,6 +380,34 @@ def test_replaced_rules_begin_without_memories():
         assert not optimizer.state[block]["momentum_buffer"].any()
 
 
+@pytest.mark.parametrize("make", OPTIMIZERS)
+def test_growth_keeps_what_is_remembered_of_other_rules_to_the_last_bit(make):
+    """With gradients given by hand, in which the new rules have no part."""
+    still, growing = grown(20), grown(20)
+    optimizers = [make(net.parameters()) for net in (still, growing)]
+    for net, optimizer in zip((still, growing), optimizers, strict=True):
+        net.follow(optimizer)
+    for step in range(6):
+        for net, optimizer in zip((still, growing), optimizers, strict=True):
+            for kind in KINDS:
+                generator = torch.Generator().manual_seed(step)
+                for block in net.blocks[kind]:  # in both networks the first two are equal
+                    block.grad = torch.randn(block.shape, generator=generator)
+            optimizer.step()
+        for x in torch.rand(10, 3):
+            growing.add_rule(x)
+    assert len(growing.blocks["widths"]) == 4
+    for kind in KINDS:
+        for i, used in enumerate((16, 4)):
+            first, second = still.blocks[kind][i], growing.blocks[kind][i]
+            assert torch.equal(first[:, :used], second[:, :used])
+            before, after = optimizers[0].state[first], optimizers[1].state[second]
+            assert before.keys() == after.keys()
+            for name in before.keys() - {"step"}:
+                assert before[name].any()
+                assert torch.equal(before[name][:, :used], after[name][:, :used])
+
+
 def test_each_kind_has_a_rate_of_its_own():
     net = grown(20)
     optimizer = torch.optim.SGD(net.parameter_groups(widths=0.01, consequents=0.5))
@@ -357,6 +438,31 @@ def test_widths_stay_positive_under_any_optimizer(follows):
     assert (net.widths >= 0.01).all() and net.widths.min() == pytest.approx(0.01)
 
 
+READERS = {
+    "observing": lambda net: net.observe(X[0]),
+    "the replay": lambda net: net.firing_functions()[0](X),
+    "a state": lambda net: net.state_dict(),
+    "a copy": lambda net: copy.deepcopy(net),
+    "another type": lambda net: net.double(),
+    "a rule more": lambda net: net.add_rule(X[0]),  # begins a block
+}
+
+
+@pytest.mark.parametrize("read", READERS.values(), ids=READERS.keys())
+def test_whoever_reads_the_widths_finds_them_bounded(read):
+    net = grown(64, min_width=0.01)
+    optimizer = torch.optim.SGD(net.parameters(), 1.0)
+    for window in net.blocks["widths"]:
+        window.grad = torch.ones_like(window)
+    optimizer.step()
+    found = read(net)
+    assert net._widths[:, :64].min().item() == pytest.approx(0.01)
+    if isinstance(found, SOFNN):
+        assert found._widths[:, :64].min().item() == pytest.approx(0.01)
+    if isinstance(found, dict):
+        assert found["blocks.widths.0"].min().item() == pytest.approx(0.01)
+
+
 def test_optimizers_that_cannot_follow_are_refused():
     net = grown(10)
     with pytest.raises(ValueError, match="no parameter of this network"):
@@ -369,5 +475,9 @@ def test_the_example_fits_its_function(capsys):
     example = Path(__file__).parents[1] / "examples" / "regression.py"
     runpy.run_path(str(example), run_name="__main__")
     words = capsys.readouterr().out.split()
-    error, constant = float(words[4].rstrip(",")), float(words[-1])
-    assert int(words[0]) > 20 and error < 0.2 * constant
+    grown, left, error, constant = int(words[0]), int(words[2]), float(words[6][:-1]), words[-1]
+    assert grown > left > 20 and error < 0.2 * float(constant)
+
+
+def test_the_example_of_the_class_runs():
+    assert doctest.testmod(sofnn).failed == 0 < doctest.testmod(sofnn).attempted

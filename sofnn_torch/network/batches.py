@@ -55,9 +55,16 @@ def factors(centres: Tensor, widths: Tensor, wrapping: Wrapping) -> Tensor:
     weighted = precision * u
     constant = (weighted * u).sum(0, keepdim=True)
     error = 0.5 * constant.detach().max() * torch.finfo(u.dtype).eps
-    if error > PRECISION and u.dtype != torch.double:
+    if u.dtype != torch.double and _exceeds(error, PRECISION):
         return factors(centres.double(), widths.double(), wrapping)
     return torch.cat([precision, weighted, constant])
+
+
+def _exceeds(error: Tensor, limit: float) -> bool:
+    try:
+        return bool(error > limit)
+    except RuntimeError:  # inside torch.func.vmap a number cannot be asked for
+        return True
 
 
 def log_firing(features: Tensor, factors: Tensor, wrapping: Wrapping) -> Tensor:

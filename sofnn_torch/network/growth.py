@@ -141,7 +141,7 @@ def criterion(growth: str | Criterion, theta: float) -> Criterion:
     kind = BUILT_IN.get(growth)
     if kind is None:
         choices = f"{', '.join(BUILT_IN)} or module:Class"
-        if ":" not in growth:
+        if not isinstance(growth, str) or ":" not in growth:
             raise ValueError(f"no growth criterion {growth!r}: give {choices}")
         try:
             kind = pkgutil.resolve_name(growth)

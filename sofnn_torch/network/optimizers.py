@@ -56,10 +56,10 @@ class Followers:
                 group[:] = [p for p in group if p is not block]
                 optimizer.state.pop(block, None)
 
-    def clear(self, block: Parameter, column: int) -> None:
-        """There is a new rule in a column of a block: nothing is remembered of it."""
+    def clear(self, blocks: Sequence[Parameter], column: int) -> None:
+        """There is a new rule in a column of these blocks: nothing is remembered of it."""
         for optimizer in self:
-            for memory in _memories(optimizer, block).values():
+            for memory in (m for block in blocks for m in _memories(optimizer, block).values()):
                 memory[:, column] = 0
 
     def select(self, blocks: Sequence[Parameter], kept: Tensor) -> None:

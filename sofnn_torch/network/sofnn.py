@@ -50,6 +50,23 @@ class SOFNN(RuleTable):
 
     Raises:
         ValueError: a setting is out of range; the message says which and what to do.
+
+    Example:
+        Any optimizer of torch fits a function while the network grows (``examples/regression.py``):
+
+        >>> _ = torch.manual_seed(0)
+        >>> net = SOFNN(1, 1, width=0.1)
+        >>> optimizer = torch.optim.Adam(net.parameter_groups(consequents=0.1))
+        >>> net.follow(optimizer)
+        >>> for _ in range(200):
+        ...     x = torch.rand(16, 1)
+        ...     _ = net.grow(x[0])
+        ...     optimizer.zero_grad()
+        ...     loss = (net(x) - torch.sin(6 * x)).square().mean()
+        ...     loss.backward()
+        ...     optimizer.step()
+        >>> loss.item() < 0.01
+        True
     """
 
     def __init__(
@@ -119,19 +136,25 @@ class SOFNN(RuleTable):
         nearest ones where a product of memberships would underflow to 0 / 0.
 
         Args:
-            x: states, or one state (n,) for one row (K,).
+            x: states, or one state (n,) for one row (K,), of any type.
             antecedents: centres and widths, each (n, K); those of the network if None.
+
+        Raises:
+            ValueError: a state has another length, or the network has no rules.
         """
         centres, widths = antecedents or (self.part(0), self.part(1))
         x = self._states(x)
-        if x.dim() == 2 and len(x) >= batches.LARGE:
+        # Compiled or exported there is one way for any number of states.
+        if x.dim() == 2 and not torch.compiler.is_compiling() and len(x) >= batches.LARGE:
             if torch.is_autocast_enabled(x.device.type):  # what cancels needs all its digits
                 with torch.autocast(x.device.type, enabled=False):
                     return self.normalised_firing(x, (centres, widths))
             factors = batches.factors(centres, widths, self.wrapping)
             features = batches.features(x.to(factors), self.wrapping)
-            return batches.log_firing(features, factors, self.wrapping).softmax(-1).to(x)
-        return (-0.5 * self._squares(x, centres, widths).sum(-2)).softmax(-1)
+            log_firing = batches.log_firing(features, factors, self.wrapping)
+        else:
+            log_firing = -0.5 * self._squares(x, centres, widths).sum(-2)
+        return _normalised(log_firing, centres.dtype)
 
     def firing_functions(self) -> tuple[Callable[[Tensor], Tensor], Callable[[Tensor], Tensor]]:
         """The normalised firing in two steps, while the antecedents stay.
@@ -142,6 +165,7 @@ class SOFNN(RuleTable):
             A function from states (.., n) to their features (.., F), and one from features to the
             normalised firing (.., K).
         """
+        self._keep_widths()
         factors = batches.factors(self._centres, self._widths, self.wrapping)
 
         def features(x: Tensor) -> Tensor:
@@ -186,7 +210,7 @@ class SOFNN(RuleTable):
         """
         if self.n_rules == 0 and not self.grow(x):
             raise ValueError("the network has no rules and may add none: build it with grid()")
-        firing = self._grow(x).softmax(0)
+        firing = _normalised(self._grow(x), self._usage.dtype)
         self._usage.add_(firing)
         return firing
 
@@ -202,10 +226,10 @@ class SOFNN(RuleTable):
         self._grow(x)
         return self.n_rules > before
 
-    @torch.no_grad()
     def _grow(self, x: Tensor) -> Tensor:
         """Apply equation 3; the logarithm of every rule's firing strength at x. Shape: (K,)."""
         x = self._state(x)
+        self._keep_widths()
         squares = self._squares(x, self._centres, self._widths)
         log_firing = squares.sum(0).mul_(-0.5)
         best = log_firing.max().item()
@@ -214,26 +238,35 @@ class SOFNN(RuleTable):
         if place is None:
             return log_firing
         centre, width, labels = place
-        if not self.add_rule(centre, width, labels=labels, log_firing=log_firing):
+        here = centre is x
+        known = log_firing if here else None
+        if not self.add_rule(centre, width, labels=labels, log_firing=known):
             return log_firing
-        if place.centre is x:
+        if here:
             return torch.cat([log_firing, log_firing.new_zeros(1)])
         newest = self._squares(x, self._centres[:, -1:], self._widths[:, -1:])
         return torch.cat([log_firing, newest.sum(0).mul_(-0.5)])
 
     def _state(self, x: Tensor) -> Tensor:
-        """One state (n,) in the network's type."""
-        if x.shape != self.default_width.shape:
+        """One state (n,) in the type to compute with, without a gradient."""
+        if x.shape != (self.n_inputs,):
             raise ValueError(f"a state of {self.n_inputs} numbers is needed, got {tuple(x.shape)}")
-        return x if x.dtype == self.default_width.dtype else x.to(self.default_width)
+        x = self._precise(x)
+        return x.detach() if x.requires_grad else x
 
     def _states(self, x: Tensor) -> Tensor:
-        """States (.., n); of whole numbers or half precision in the network's type."""
+        """States (.., n) in the type to compute with."""
         if not 0 < x.dim() < 3 or x.shape[-1] != self.n_inputs:
             shape = tuple(x.shape)
             raise ValueError(f"states (B, {self.n_inputs}) are needed, got the shape {shape}")
-        precise = x.dtype in (torch.float32, torch.float64)
-        return x if precise else x.to(self.default_width.dtype)
+        return self._precise(x)
+
+    def _precise(self, x: Tensor) -> Tensor:
+        """States of any type in that of the network, but never in half precision."""
+        dtype = self._usage.dtype
+        if x.dtype == dtype and dtype.itemsize > 2:
+            return x
+        return x.to(torch.promote_types(dtype, torch.float32))
 
     def add_rule(
         self,
@@ -273,7 +306,7 @@ class SOFNN(RuleTable):
         if log_firing is None:
             firing = self.normalised_firing(centre, (self._centres, self._widths))
         else:
-            firing = log_firing.softmax(0)
+            firing = _normalised(log_firing, self._usage.dtype)
         return torch.where(self.interpolate, self.conclude(firing), self.initial)
 
     def replace_rules(self, centres: Tensor, widths: Tensor, consequents: Tensor) -> None:
@@ -302,6 +335,12 @@ class SOFNN(RuleTable):
             "rules/share_used": used,
             "rules/refused": float(self.refused),
         }
+
+
+def _normalised(log_firing: Tensor, dtype: torch.dtype) -> Tensor:
+    """Softmax in the type of the logarithms, which may be too large for another."""
+    firing = log_firing.softmax(-1)
+    return firing if firing.dtype == dtype else firing.to(dtype)
 
 
 def grid(axes: Sequence[Axis], shape: Sequence[int], n_outputs: int, **settings) -> SOFNN:

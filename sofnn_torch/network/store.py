@@ -11,7 +11,7 @@ table appends a block of each that is as large as all before it together.
 import copy
 from collections.abc import Mapping, Sequence
 from itertools import accumulate, pairwise
-from operator import is_
+from operator import attrgetter, is_
 from typing import Any, Self
 
 import torch
@@ -21,6 +21,7 @@ from sofnn_torch.network.optimizers import Followers
 from sofnn_torch.network.parameters import Blocks, Window
 
 KINDS = ("centres", "widths", "consequents")
+VERSION = attrgetter("_version")  # counts what is written in place
 STORES = ("table", "traces", "usage", "labels")
 COUNTED = ("traces", "usage", "labels")  # what has a column for each rule beside the parameters
 VIEWS = {"_active", "_active_parts", "_centres", "_widths", "_consequents", "_traces", "_usage"}
@@ -88,9 +89,10 @@ class RuleStore(nn.Module):
         k, blocks = self.n_rules, self._lists[kind].tensors()
         if k == 0:
             raise ValueError("the network has no rules yet: call grow(x) or add_rule(centre)")
-        self._keep_widths()
-        if not torch.is_grad_enabled() and all(map(is_, blocks, self._windows[kind])):
-            return self._active_parts[kind]
+        if all(map(is_, blocks, self._windows[kind])):
+            self._keep_widths()
+            if not torch.is_grad_enabled():
+                return self._active_parts[kind]
         # In a functional call others stand in the places of the windows.
         return (torch.cat(blocks, 1) if len(blocks) > 1 else blocks[0])[:, :k]
 
@@ -197,6 +199,8 @@ class RuleStore(nn.Module):
     @torch.inference_mode(False)
     def _shape_blocks(self, sizes: Sequence[int]) -> None:
         """Keep the first blocks that have these sizes, drop the others, append what is missing."""
+        if self.block_sizes:
+            self._keep_widths()
         kept = 0
         while sizes[: kept + 1] == self.block_sizes[: kept + 1] and kept < len(sizes):
             kept += 1
@@ -229,7 +233,7 @@ class RuleStore(nn.Module):
 
     def _written(self) -> int:
         """Changes whenever anything writes to the Parameters of the widths."""
-        return sum(window._version for window in self._windows[1])
+        return sum(map(VERSION, self._windows[1]))
 
     def _activate(self, n_rules: int) -> None:
         """Set the number of rules; the views of what belongs to them are made when next needed."""
@@ -266,7 +270,10 @@ class RuleStore(nn.Module):
 
     def _apply(self, fn, recurse: bool = True) -> Self:
         """To another type, another device or shared memory: the table, then its windows."""
+        self._keep_widths()
         store = {name: fn(values) for name, values in self._store.items()}
+        if store["table"].is_meta:
+            raise ValueError("the device meta has no numbers: a network cannot be moved there")
         gradients = [window.grad for windows in self._windows for window in windows]
         self._show(store)
         windows = [window for windows in self._windows for window in windows]
@@ -291,6 +298,7 @@ class RuleStore(nn.Module):
         return copy.deepcopy(self)  # two networks that grow in one table would tear it
 
     def __getstate__(self) -> dict[str, Any]:
+        self._keep_widths()
         state = dict(self.__dict__)
         if not self._is_shared:  # the reserved memory stays behind
             state["_store"] = {k: s[..., : self.capacity].clone() for k, s in self._store.items()}
@@ -307,6 +315,7 @@ class RuleStore(nn.Module):
         self._activate(self.n_rules)
 
     def _save_to_state_dict(self, destination, prefix, keep_vars) -> None:
+        self._keep_widths()
         super()._save_to_state_dict(destination, prefix, keep_vars)
         for name in COUNTED:  # torch.save would write all that the stores have reserved
             destination[prefix + name] = getattr(self, name).clone()
@@ -316,9 +325,9 @@ class RuleStore(nn.Module):
         self, state_dict, prefix, local_metadata, strict, missing, unexpected, errors
     ) -> None:
         """All or nothing; the state of a whole network brings its own number of rules."""
-        if local_metadata.get("assign_to_params_buffers"):
-            raise ValueError("load_state_dict(assign=True) would tear the table: leave it out")
         own = {key[len(prefix) :]: v for key, v in state_dict.items() if key.startswith(prefix)}
+        if own and local_metadata.get("assign_to_params_buffers"):
+            raise ValueError("load_state_dict(assign=True) would tear the table: leave it out")
         count, sizes = self.n_rules, self.block_sizes
         if own.keys() >= {"traces", "blocks.consequents.0"}:
             count, sizes = own["traces"].shape[-1], _stored_sizes(own)

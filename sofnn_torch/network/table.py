@@ -85,12 +85,10 @@ class RuleTable(RuleStore):
         k, n, numbers = self.n_rules, self.n_inputs, column.tolist()
         if not (math.isfinite(sum(map(abs, numbers))) and min(numbers[n : 2 * n]) > 0):
             raise ValueError(f"a rule needs finite numbers and positive widths: {numbers}")
-        if self._is_shared:
-            raise ValueError("other processes share this network: no rule can be added")
+        self._check_alone()
         if k == self.capacity:
             self._shape_blocks(self._sizes_for(k + 1))
-        for windows in self._windows:
-            self._followers.clear(windows[-1], k - self.capacity)
+        self._followers.clear([windows[-1] for windows in self._windows], k - self.capacity)
         self._store["table"].select(1, k).copy_(column.detach())
         if self.shared:
             fresh = self.labels.amax(1) + 1 if k else 0
@@ -102,10 +100,12 @@ class RuleTable(RuleStore):
         """Drop every rule where the mask keep (K,) is False; how many were dropped.
 
         Raises:
-            ValueError: the mask has another length or would leave no rule.
+            ValueError: the mask has another length or would leave no rule, or other processes
+                share the memory.
         """
         if keep.shape != (self.n_rules,) or not keep.any():
             raise ValueError(f"keep must be a mask of {self.n_rules} rules with at least one True")
+        self._check_alone()
         before, kept = self.n_rules, keep.nonzero().flatten()
         self._rewrite(kept, {name: store[..., kept] for name, store in self._store.items()})
         return before - self.n_rules
@@ -124,7 +124,7 @@ class RuleTable(RuleStore):
 
         Raises:
             ValueError: a shape or number that no rule may have, no rule, or more than
-                ``max_rules``. Nothing is changed then.
+                ``max_rules``, or other processes share the memory. Nothing is changed then.
         """
         count, n = len(centres), self.n_inputs
         parts = [part.to(self._active) for part in (centres, widths, consequents)]
@@ -137,6 +137,7 @@ class RuleTable(RuleStore):
         table = torch.cat(parts, 1).T
         if not (table.isfinite().all() and (table[n : 2 * n] >= self.min_width).all()):
             raise ValueError(f"rules need finite numbers and widths of {self.min_width} or more")
+        self._check_alone()
         labels = {"labels": self._labels_for(table)} if self.shared else {}
         self._rewrite(self.labels.new_empty(0), {"table": table} | labels)
 
@@ -151,6 +152,10 @@ class RuleTable(RuleStore):
             label[index[:k]] = self.labels[i]
             labels.append(label[index[k:]])
         return torch.stack(labels)
+
+    def _check_alone(self) -> None:
+        if self._is_shared:
+            raise ValueError("other processes share this network: no rule can be added or dropped")
 
     def _rewrite(self, kept: Tensor, columns: dict[str, Tensor]) -> None:
         """Make these columns the rules, with zeros in what is not given.
