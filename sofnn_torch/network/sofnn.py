@@ -130,7 +130,8 @@ class SOFNN(RuleTable):
                     return self.normalised_firing(x, (centres, widths))
             factors = batches.factors(centres, widths, self.wrapping)
             features = batches.features(x.to(factors), self.wrapping)
-            return batches.log_firing(features, factors, self.wrapping).softmax(-1).to(x)
+            firing = batches.log_firing(features, factors, self.wrapping).softmax(-1)
+            return firing.to(torch.promote_types(x.dtype, centres.dtype))
         return (-0.5 * self._squares(x, centres, widths).sum(-2)).softmax(-1)
 
     def firing_functions(self) -> tuple[Callable[[Tensor], Tensor], Callable[[Tensor], Tensor]]:
@@ -171,7 +172,8 @@ class SOFNN(RuleTable):
             angle.sub_((angle * frequency).round_(), alpha=period)
         if tracked:
             return (difference / widths).square()
-        return difference.div_(widths).square_()  # new memory costs as much as the arithmetic
+        difference.div_(widths)  # new memory costs as much as the arithmetic
+        return difference.mul_(difference)
 
     # ------------------------------------------------------------------------- structure, eq. 3
 
@@ -254,16 +256,16 @@ class SOFNN(RuleTable):
             log_firing: logarithm of the firing strengths at the centre, if known. Shape: (K,).
 
         Raises:
-            ValueError: a value is not finite or a width is not positive.
+            ValueError: a shape is another, a value is not finite or a width is not positive.
         """
-        k = self.n_rules
-        if k >= self.max_rules:
+        centre = self._state(centre)
+        if self.n_rules >= self.max_rules:
             self.refused += 1
             return False
         width = self.default_width if width is None else width
         if consequents is None:
             consequents = self._first_consequents(centre, log_firing)
-        self._append(torch.cat([centre, width, consequents]), labels)
+        self._append((centre, width, consequents), labels)
         return True
 
     def _first_consequents(self, centre: Tensor, log_firing: Tensor | None) -> Tensor:
@@ -282,7 +284,7 @@ class SOFNN(RuleTable):
         Raises:
             ValueError: also if a frozen structure would get another number of rules.
         """
-        if self.growth == "frozen" and self.n_rules not in (0, len(centres)):
+        if not self.criterion.grows and self.n_rules not in (0, len(centres)):
             raise ValueError(
                 f"a frozen structure keeps its {self.n_rules} rules, got {len(centres)}"
             )
