@@ -105,7 +105,7 @@ def test_parameters_cannot_be_exchanged_pruned_or_parametrized():
         lambda: delattr(net.blocks.centres, "0"),
         lambda: net.blocks.centres.append(torch.zeros(3, 16)),
     ):
-        with pytest.raises((ValueError, RuntimeError), match="in place|type Window") as refusal:
+        with pytest.raises((ValueError, RuntimeError), match=r"in place|type Window") as refusal:
             act()
         assert "\n" not in str(refusal.value)
         assert_unchanged(net, before)
@@ -262,7 +262,7 @@ def test_a_part_of_another_number_of_rules_is_refused():
 def test_the_state_of_another_network_is_refused_and_changes_nothing():
     net = network()
     before = numbers(net)
-    with pytest.raises(RuntimeError, match="blocks.consequents.0 has the shape"):
+    with pytest.raises(RuntimeError, match=r"blocks.consequents.0 has the shape"):
         net.load_state_dict(network(outputs=2).state_dict())
     assert_unchanged(net, before)
 
@@ -393,7 +393,7 @@ def test_a_rule_of_another_shape_is_not_added():
 
 @pytest.mark.parametrize("shape", [(8, 1), (64, 1), (8, 4), (64, 4), (3, 3, 3), ()])
 def test_states_of_another_shape_are_refused_in_one_line(shape):
-    with pytest.raises(ValueError, match="states .* are needed"):
+    with pytest.raises(ValueError, match=r"states .* are needed"):
         network()(torch.rand(shape))
 
 
