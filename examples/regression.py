@@ -19,7 +19,7 @@ def target(x: torch.Tensor) -> torch.Tensor:
     return torch.sin(6 * x[:, :1]) * x[:, 1:]
 
 
-def fit(steps: int = 600, batch: int = 64, seed: int = 0) -> SOFNN:
+def fit(steps: int = 400, batch: int = 64, seed: int = 0) -> SOFNN:
     """A network that has seen so many batches of random samples.
 
     Args:

@@ -50,6 +50,13 @@ class SOFNN(RuleTable):
 
     Raises:
         ValueError: a setting is out of range; the message says which and what to do.
+
+    Example:
+        >>> net = SOFNN(2, 1, width=0.2)
+        >>> [net.grow(torch.tensor(x)) for x in ([0.1, 0.1], [0.1, 0.2], [0.9, 0.9])]
+        [True, False, True]
+        >>> net(torch.tensor([[0.5, 0.5]])).shape
+        torch.Size([1, 1])
     """
 
     def __init__(
