@@ -1,10 +1,11 @@
 """Settings that are checked when they are made: types and bounds stand at each field.
 
-    @dataclass(frozen=True)
-    class Motor(Settings, table="motor"):
-        gain: Annotated[float, Within(above=0, most=10)] = 1.0
-
-    Motor(gain=11)  # ValueError: --motor.gain must be at most 10, got 11
+    >>> @dataclass(frozen=True)
+    ... class Motor(Settings, table="motor"):
+    ...     gain: Annotated[float, Within(above=0, most=10)] = 1.0
+    >>> Motor(gain=11)
+    Traceback (most recent call last):
+    ValueError: --motor.gain must lie in (0, 10], got 11.0
 
 NumPy's scalars become Python's, so that what is written of settings can be read again.
 """

@@ -8,6 +8,7 @@ import torch
 
 from sofnn_torch.bounds import Positive, Settings, Share, Within
 from sofnn_torch.learners import Learner, Output
+from sofnn_torch.network.growth import Criterion, Place
 
 
 @dataclass(frozen=True)
@@ -74,3 +75,15 @@ class Sarsa(Learner):
     def _policy(self, x):
         value, best = self.net(x).max(1)
         return best, value
+
+
+class Pairs(Criterion):
+    """A rule where fewer than two rules fire by theta."""
+
+    def place(self, net, x, squares, log_firing, best):
+        """At the state itself."""
+        return Place(x) if (log_firing >= self.log_theta).sum() < 2 else None
+
+
+class Greedy(Criterion):
+    """No criterion: it does not say where."""

@@ -1,6 +1,7 @@
 """A learner of one's own goes through the package's own loop; no file of the package changes."""
 
 import os
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -11,10 +12,11 @@ import pytest
 import torch
 from conftest import quick_options
 
-from sofnn_torch import Config, load, resume, train
+from sofnn_torch import SOFNN, Config, NetworkConfig, load, resume, train
 from sofnn_torch.evaluate import evaluate
 from sofnn_torch.rules import __main__ as rules
 from sofnn_torch.rules import files, words
+from sofnn_torch.runs import checkpoint
 
 OWN = "own:Sarsa"
 
@@ -76,6 +78,45 @@ def test_the_command_line_finds_it(tmp_path):
     assert done.returncode == 0, done.stderr
     (path,) = tmp_path.iterdir()
     assert load(path).agent.settings.epsilon == pytest.approx(0.3)
+
+
+def test_a_criterion_of_ones_own_adds_rules_where_it_says():
+    net = SOFNN(1, 1, width=1.0, theta=0.5, growth="own:Pairs")
+    # A rule fires by 0.5 up to sqrt(2 ln 2) = 1.18 widths away.
+    grown = [net.grow(torch.tensor([x])) for x in (0.0, 0.0, 1.1, -1.1, 1.2, 1.25, 1.21)]
+    assert grown == [True, True, False, False, True, True, False]
+    assert net.growth == "own:Pairs" and net.theta == 0.5
+
+
+def test_a_criterion_of_ones_own_trains_stops_and_goes_on_to_the_last_bit(tmp_path, same_run):
+    settings = config(trials=2, agent="q", own=(), net=NetworkConfig(growth="own:Pairs"))
+    whole = train(settings, quick_options(tmp_path / "whole", checkpoint_every=1))
+    half = train(replace(settings, trials=1), quick_options(tmp_path, checkpoint_every=1))
+    _, state, _ = checkpoint.find_latest(half)
+    assert state["network"]["growth"] == "own:Pairs" and state["network"]["rules"] > 10
+    same_run(resume(half, quick_options(tmp_path, checkpoint_every=1), trials=2), whole)
+    loaded = load(whole)
+    assert loaded.agent.net.growth == "own:Pairs" == loaded.config.net.growth
+    records = evaluate(loaded.config, loaded.agent, episodes=1)
+    assert len(words.read(loaded.agent).sentences()) == loaded.agent.net.n_rules
+    assert len(records) == 1
+
+
+@pytest.mark.parametrize(
+    ("growth", "message"),
+    [
+        ("pairs", "no growth criterion 'pairs': give rule, input, literal, frozen or module:Class"),
+        ("own:Trios", "no growth criterion 'own:Trios' (module 'own' has no attribute 'Trios')"),
+        ("nowhere:Pairs", "No module named 'nowhere'"),
+        ("own:Sarsa", "own:Sarsa is no class of sofnn_torch.network.growth.Criterion"),
+        ("own:Greedy", "own:Greedy cannot be made from theta alone"),
+        ("", "no growth criterion ''"),
+    ],
+)
+def test_an_unknown_criterion_is_one_line(growth, message):
+    with pytest.raises(ValueError, match=re.escape(message)) as refusal:
+        Config(net=NetworkConfig(growth=growth))
+    assert "\n" not in str(refusal.value)
 
 
 @pytest.mark.parametrize(

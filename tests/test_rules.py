@@ -242,7 +242,7 @@ def test_rules_that_no_network_may_have_change_nothing(what):
     if what == "shape":
         consequents = consequents.expand(-1, 2)
     if what == "frozen":
-        net.growth = "frozen"
+        net.criterion.grows = False
     with pytest.raises(ValueError):
         net.replace_rules(centres, widths, consequents)
     assert torch.equal(net.table().detach(), before)

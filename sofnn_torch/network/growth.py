@@ -150,4 +150,7 @@ def criterion(growth: str | Criterion, theta: float) -> Criterion:
             raise ValueError(f"no growth criterion {growth!r} ({reason}): give {choices}") from None
         if not (isinstance(kind, type) and issubclass(kind, Criterion)):
             raise ValueError(f"{growth} is no class of {__name__}.Criterion: give {choices}")
-    return kind(theta)
+    try:
+        return kind(theta)
+    except TypeError as error:  # it has no place(), or asks for more
+        raise ValueError(f"{growth} cannot be made from theta alone: {error}") from None

@@ -1,7 +1,7 @@
 """Optimizers that go on through changes of structure: new blocks of parameters, moved rules.
 
-What an optimizer remembers of a parameter in a tensor of its shape (a momentum, the moments of
-Adam) belongs to rules column by column, as the parameter itself does, and moves with them.
+What an optimizer remembers of a parameter in a tensor with as many columns (a momentum, the moments
+of Adam) belongs to rules column by column, as the parameter itself does, and moves with them.
 """
 
 import weakref
@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 import torch
 from torch import Tensor
 from torch.nn import Parameter
-from torch.optim import LBFGS, Optimizer
+from torch.optim import LBFGS, Adagrad, Optimizer
 
 
 class Followers:
@@ -31,8 +31,9 @@ class Followers:
         Raises:
             ValueError: it has none of the parameters, or keeps no state rule by rule.
         """
-        if isinstance(optimizer, LBFGS):
-            raise ValueError("LBFGS remembers all parameters together: it cannot follow growth")
+        if isinstance(optimizer, LBFGS | Adagrad):  # one vector of all; made once at the start
+            kind = type(optimizer).__name__
+            raise ValueError(f"{kind} keeps no state rule by rule: it cannot follow growth")
         if not any(_group(optimizer, p) for p in parameters):
             raise ValueError("the optimizer has no parameter of this network")
         if any(optimizer is other for other in self):
@@ -60,7 +61,7 @@ class Followers:
         """There is a new rule in a column of these blocks: nothing is remembered of it."""
         for optimizer in self:
             for memory in (m for block in blocks for m in _memories(optimizer, block).values()):
-                memory[:, column] = 0
+                memory[..., column] = 0
 
     def select(self, blocks: Sequence[Parameter], kept: Tensor) -> None:
         """Of the columns of all blocks together those kept, by number, have become the first."""
@@ -69,16 +70,17 @@ class Followers:
             memories = [_memories(optimizer, block) for block in blocks]
             for name in {name for memory in memories for name in memory}:
                 parts = [memory.get(name) for memory in memories]
+                some = next(part for part in parts if part is not None)
                 whole = torch.cat(
                     [
-                        torch.zeros_like(block) if part is None else part
-                        for part, block in zip(parts, blocks, strict=True)
+                        some.new_zeros(*some.shape[:-1], size) if part is None else part
+                        for part, size in zip(parts, sizes, strict=True)
                     ],
-                    1,
+                    -1,
                 )
                 moved = torch.zeros_like(whole)
-                moved[:, : len(kept)] = whole[:, kept]
-                for part, values in zip(parts, moved.split_with_sizes(sizes, 1), strict=True):
+                moved[..., : len(kept)] = whole[..., kept]
+                for part, values in zip(parts, moved.split_with_sizes(sizes, -1), strict=True):
                     if part is not None:
                         part.copy_(values)
 
@@ -92,4 +94,4 @@ def _group(optimizer: Optimizer, parameter: Parameter) -> list[Parameter] | None
 def _memories(optimizer: Optimizer, block: Parameter) -> dict[str, Tensor]:
     """What the optimizer remembers of a block rule by rule."""
     state = optimizer.state.get(block, {}).items()
-    return {k: v for k, v in state if isinstance(v, Tensor) and v.shape == block.shape}
+    return {k: v for k, v in state if isinstance(v, Tensor) and v.shape[-1:] == block.shape[-1:]}

@@ -52,21 +52,11 @@ class SOFNN(RuleTable):
         ValueError: a setting is out of range; the message says which and what to do.
 
     Example:
-        Any optimizer of torch fits a function while the network grows (``examples/regression.py``):
-
-        >>> _ = torch.manual_seed(0)
-        >>> net = SOFNN(1, 1, width=0.1)
-        >>> optimizer = torch.optim.Adam(net.parameter_groups(consequents=0.1))
-        >>> net.follow(optimizer)
-        >>> for _ in range(200):
-        ...     x = torch.rand(16, 1)
-        ...     _ = net.grow(x[0])
-        ...     optimizer.zero_grad()
-        ...     loss = (net(x) - torch.sin(6 * x)).square().mean()
-        ...     loss.backward()
-        ...     optimizer.step()
-        >>> loss.item() < 0.01
-        True
+        >>> net = SOFNN(2, 1, width=0.2)
+        >>> [net.grow(torch.tensor(x)) for x in ([0.1, 0.1], [0.1, 0.2], [0.9, 0.9])]
+        [True, False, True]
+        >>> net(torch.tensor([[0.5, 0.5]])).shape
+        torch.Size([1, 1])
     """
 
     def __init__(
@@ -195,7 +185,8 @@ class SOFNN(RuleTable):
             angle.sub_((angle * frequency).round_(), alpha=period)
         if tracked:
             return (difference / widths).square()
-        return difference.div_(widths).square_()  # new memory costs as much as the arithmetic
+        difference.div_(widths)  # new memory costs as much as the arithmetic
+        return difference.mul_(difference)
 
     # ------------------------------------------------------------------------- structure, eq. 3
 
@@ -287,16 +278,16 @@ class SOFNN(RuleTable):
             log_firing: logarithm of the firing strengths at the centre, if known. Shape: (K,).
 
         Raises:
-            ValueError: a value is not finite or a width is not positive.
+            ValueError: a shape is another, a value is not finite or a width is not positive.
         """
-        k = self.n_rules
-        if k >= self.max_rules:
+        centre = self._state(centre)
+        if self.n_rules >= self.max_rules:
             self.refused += 1
             return False
         width = self.default_width if width is None else width
         if consequents is None:
             consequents = self._first_consequents(centre, log_firing)
-        self._append(torch.cat([centre, width, consequents]), labels)
+        self._append((centre, width, consequents), labels)
         return True
 
     def _first_consequents(self, centre: Tensor, log_firing: Tensor | None) -> Tensor:
@@ -315,7 +306,7 @@ class SOFNN(RuleTable):
         Raises:
             ValueError: also if a frozen structure would get another number of rules.
         """
-        if self.growth == "frozen" and self.n_rules not in (0, len(centres)):
+        if not self.criterion.grows and self.n_rules not in (0, len(centres)):
             raise ValueError(
                 f"a frozen structure keeps its {self.n_rules} rules, got {len(centres)}"
             )

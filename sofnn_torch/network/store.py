@@ -74,7 +74,7 @@ class RuleStore(nn.Module):
         self.parts = (n_inputs, n_inputs, n_outputs)  # rows of u, v and c in the table
         self.blocks = nn.ModuleDict({kind: Blocks() for kind in KINDS})
         self._lists = tuple(self.blocks.values())
-        self._followers, self._is_shared = Followers(), False
+        self._followers, self._is_shared, self._strict = Followers(), False, False
         self.capacity, self.block_sizes = 0, []  # rules that fit before a block is appended
         self.register_buffer("refused", torch.tensor(0))
         with torch.inference_mode(False):
@@ -163,7 +163,7 @@ class RuleStore(nn.Module):
         starts without. Copies of the network and of the optimizer do not follow.
 
         Raises:
-            ValueError: it has no parameter of this network, or is `torch.optim.LBFGS`.
+            ValueError: it has no parameter of this network, or is LBFGS or Adagrad.
         """
         if self._followers.add(optimizer, list(self.parameters())):
             optimizer.register_step_post_hook(lambda *_: self._keep_widths())
@@ -280,7 +280,6 @@ class RuleStore(nn.Module):
         for window, gradient in zip(windows, gradients, strict=True):
             window.grad = None if gradient is None else fn(gradient)
         super()._apply(fn, recurse=False)
-        self._is_shared = store["table"].device.type == "cpu" and store["table"].is_shared()
         self._activate(self.n_rules)
         return self
 
@@ -291,7 +290,8 @@ class RuleStore(nn.Module):
             for window, (start, end) in zip(windows, pairwise(ends), strict=True):
                 window.grad = None  # it has the old type
                 window.show(rows[:, start:end])
-        self._store = store
+        table = store["table"]
+        self._store, self._is_shared = store, not table.is_cuda and table.is_shared()
         self._seen = self._written()
 
     def __copy__(self) -> Self:
@@ -306,11 +306,11 @@ class RuleStore(nn.Module):
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__(state)
-        if not self._is_shared:
-            columns = self._store
+        columns = self._store
+        if columns["table"].is_cuda or not columns["table"].is_shared():  # a copy never is
             self._reserve(columns["table"])
             for name, values in columns.items():
-                self._store[name][..., : self.capacity] = values
+                self._store[name][..., : self.capacity] = values[..., : self.capacity]
         self._show(self._store)
         self._activate(self.n_rules)
 
@@ -320,11 +320,22 @@ class RuleStore(nn.Module):
         for name in COUNTED:  # torch.save would write all that the stores have reserved
             destination[prefix + name] = getattr(self, name).clone()
 
+    def load_state_dict(self, state_dict, strict: bool = True, assign: bool = False):
+        """As for any module; the state of a whole network brings its own number of rules.
+
+        A load that is refused changes nothing.
+        """
+        self._strict = strict  # torch tells no module
+        try:
+            return super().load_state_dict(state_dict, strict, assign)
+        finally:
+            self._strict = False
+
     @torch.no_grad()
     def _load_from_state_dict(
         self, state_dict, prefix, local_metadata, strict, missing, unexpected, errors
     ) -> None:
-        """All or nothing; the state of a whole network brings its own number of rules."""
+        """Load what is given and fits, or nothing where any of it does not."""
         own = {key[len(prefix) :]: v for key, v in state_dict.items() if key.startswith(prefix)}
         if own and local_metadata.get("assign_to_params_buffers"):
             raise ValueError("load_state_dict(assign=True) would tear the table: leave it out")
@@ -341,10 +352,12 @@ class RuleStore(nn.Module):
         ]
         if not count <= min(sum(sizes), self.max_rules):
             wrong.append(f"{prefix}traces of {count} rules: must be at most {self.max_rules}")
+        if absent and (count, sizes) != (self.n_rules, self.block_sizes):
+            wrong.append(f"{prefix}traces of {count} rules, not {self.n_rules}: must be whole")
         missing += [prefix + name for name in absent]
         unexpected += [prefix + name for name in foreign]
         errors += wrong
-        if wrong or (strict and (absent or foreign)) or not own:
+        if wrong or (self._strict and (absent or foreign)):
             return
         self._shape_blocks(sizes)
         self._activate(count)

@@ -70,18 +70,25 @@ class RuleTable(RuleStore):
 
     # -------------------------------------------------------------------- rules that come and go
 
-    def _append(self, column: Tensor, labels: Tensor | None) -> None:
+    def _append(self, parts: tuple[Tensor, Tensor, Tensor], labels: Tensor | None) -> None:
         """Add one rule at the end.
 
         Args:
-            column: its parameters. Shape: (2n+m,).
+            parts: its centres (n,), widths (n,) and consequents (m,).
             labels: which shared membership function each input uses; a new one each if None.
                 Shape: (n,).
 
         Raises:
-            ValueError: a value is not finite or a width is not positive, or other processes share
-                the memory.
+            ValueError: a shape is another, a value is not finite or a width is not positive, or
+                other processes share the memory.
         """
+        shapes = [(*part.shape,) for part in parts]
+        if shapes != [(rows,) for rows in self.parts]:
+            raise ValueError(
+                f"a rule has {self.n_inputs} centres, {self.n_inputs} widths and "
+                f"{self.n_outputs} consequents, got the shapes {shapes}"
+            )
+        column = torch.cat(parts).detach()
         k, n, numbers = self.n_rules, self.n_inputs, column.tolist()
         if not (math.isfinite(sum(map(abs, numbers))) and min(numbers[n : 2 * n]) > 0):
             raise ValueError(f"a rule needs finite numbers and positive widths: {numbers}")
@@ -166,6 +173,8 @@ class RuleTable(RuleStore):
         """
         for windows in self._windows:
             self._followers.select(windows, kept)
+            for window in windows:
+                window.grad = None  # of rules that have moved or are gone
         count = columns["table"].shape[1]
         self._shape_blocks(self._sizes_for(count))
         self._write(columns, count)

@@ -84,7 +84,7 @@ def schema(agent: Learner) -> Schema:
     low[n : 2 * n] = net.min_width
     for row, output in enumerate(agent.outputs, 2 * n):
         low[row], high[row] = max(low[row], output.low), min(high[row], output.high)
-    counts = (net.n_rules, net.n_rules) if net.growth == "frozen" else (1, net.max_rules)
+    counts = (net.n_rules, net.n_rules) if not net.criterion.grows else (1, net.max_rules)
     inputs = tuple((axis.name, axis.unit) for axis in agent.inputs)
     outputs = tuple(output.name.replace(" ", "_") for output in agent.outputs)
     return Schema(agent.name, inputs, outputs, low, high, counts)
