@@ -266,7 +266,7 @@ def test_growth_keeps_everything_learned_across_blocks():
         net.traces[:, k], net.usage[k] = float(k), float(k)
     for kind, rows in (("centres", 3), ("widths", 3), ("consequents", 2)):
         shapes = [tuple(block.shape) for block in net.blocks[kind]]
-        assert shapes == [(rows, size) for size in (4, 4, 8, 16, 32)]
+        assert shapes == [(rows, size) for size in (4, 12, 48)]
     torch.testing.assert_close(net.centres, states(40))
     assert net.traces[0].tolist() == net.usage.tolist() == list(map(float, range(40)))
 
@@ -366,7 +366,7 @@ def test_a_copy_learns_in_parameters_of_its_own(duplicate):
     before, twin = net.table().detach().clone(), duplicate(net)
     assert torch.equal(twin.table(), before)
     twin.clamp_consequents(0, 2, 3.0, 3.0)
-    assert (twin.part(2) == 3).all()  # the joined blocks, which optimizers see
+    assert (twin.joined()[2] == 3).all()  # the joined blocks, which optimizers see
     assert torch.equal(net.table(), before)
 
 

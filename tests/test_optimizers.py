@@ -123,7 +123,7 @@ def test_each_kind_learns_at_its_rate_in_every_block():
     after = (net.centres, net.widths, net.consequents)
     for old, new, gradient, rate in zip(before, after, gradients, KINDS.values(), strict=True):
         torch.testing.assert_close(new, old - rate * gradient)
-    assert [len(group["params"]) for group in optimizer.param_groups] == [3, 3, 3]
+    assert [len(group["params"]) for group in optimizer.param_groups] == [2, 2, 2]
     assert all(gradient.any() for gradient in gradients)
 
 
@@ -149,7 +149,7 @@ def test_widths_keep_their_bound_under_any_optimizer(make, follow):
         net.follow(optimizer)
     for _ in range(3):
         optimizer.zero_grad()
-        net.part(1).sum().backward()  # narrower is better
+        net.joined()[1].sum().backward()  # narrower is better
         optimizer.step()
         if follow:  # also before anyone asks
             assert (torch.cat(list(net.blocks.widths), 1)[:, :12] == 0.05).all()

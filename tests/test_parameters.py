@@ -17,8 +17,8 @@ X = torch.rand(64, 3, generator=torch.Generator().manual_seed(1))
 
 
 def network(rules=60, outputs=1, **settings):
-    """So many rules at random places in blocks of 16, with consequents of all sizes."""
-    settings = {"width": 0.06, "initial": 1.0, "block_size": 16} | settings
+    """So many rules at random places in blocks of 4, 12 and 48, with consequents of all sizes."""
+    settings = {"width": 0.06, "initial": 1.0, "block_size": 4} | settings
     net, generator = SOFNN(3, outputs, **settings), torch.Generator().manual_seed(0)
     while net.n_rules < rules:
         net.grow(torch.rand(3, generator=generator))
@@ -58,11 +58,11 @@ def assert_unchanged(net, before, rules=60):
 
 def test_there_are_centres_widths_and_consequents_in_lists_that_grow():
     net, seen = network(1), []
-    for rules in (16, 17, 33):
+    for rules in (4, 5, 17):
         while net.n_rules < rules:
             net.add_rule(torch.full((3,), float(net.n_rules)))
         seen.append([(name, *p.shape) for name, p in net.blocks.centres.named_parameters()])
-    first, second, third = ("0", 3, 16), ("1", 3, 16), ("2", 3, 32)
+    first, second, third = ("0", 3, 4), ("1", 3, 12), ("2", 3, 48)
     assert seen == [[first], [first, second], [first, second, third]]
     assert [len(blocks) for blocks in net.blocks.values()] == [3, 3, 3]
 
@@ -82,7 +82,7 @@ def test_what_is_given_as_data_is_written_into_the_table():
     assert (net.centres == 3).all() and (net.widths == 3).all() and (net.consequents == 3).all()
     assert_true(net)
     with pytest.raises(ValueError, match="keeps its shape"):
-        net.blocks.centres[0].data = torch.zeros(3, 4)
+        net.blocks.centres[0].data = torch.zeros(3, 5)
 
 
 @pytest.mark.parametrize("write", [torch.Tensor.zero_, lambda p: nn.init.constant_(p, -1.0)])
@@ -101,9 +101,9 @@ def test_parameters_cannot_be_exchanged_pruned_or_parametrized():
         lambda: prune.l1_unstructured(net.blocks.centres, "0", 0.5),
         lambda: parametrize.register_parametrization(net.blocks.centres, "0", nn.ReLU()),
         lambda: nn.utils.parametrizations.weight_norm(net.blocks.widths, "1"),
-        lambda: setattr(net.blocks.centres, "0", nn.Parameter(torch.zeros(3, 16))),
+        lambda: setattr(net.blocks.centres, "0", nn.Parameter(torch.zeros(3, 4))),
         lambda: delattr(net.blocks.centres, "0"),
-        lambda: net.blocks.centres.append(torch.zeros(3, 16)),
+        lambda: net.blocks.centres.append(torch.zeros(3, 4)),
     ):
         with pytest.raises((ValueError, RuntimeError), match=r"in place|type Window") as refusal:
             act()
@@ -156,7 +156,7 @@ def test_other_processes_see_what_is_written_and_no_rule_is_added():
     process.start()
     process.join(20)
     assert process.exitcode == 0
-    assert (net.consequents[16:32] == 5).all()
+    assert (net.consequents[4:16] == 5).all()
     assert_true(net)
     with pytest.raises(ValueError, match="share this network"):
         net.grow(torch.full((3,), 9.0))
@@ -223,7 +223,7 @@ def test_a_partial_load_writes_the_part_that_it_has(nested):
     net = network()
     before, whole = numbers(net), nn.Sequential(net) if nested else net
     name = "0." * nested + "blocks.consequents.1"
-    result = whole.load_state_dict({name: torch.full((1, 16), 4.0)}, strict=False)
+    result = whole.load_state_dict({name: torch.full((1, 12), 4.0)}, strict=False)
     assert len(result.missing_keys) == 8 + 4 and not result.unexpected_keys
     before[7].fill_(4.0)
     assert_unchanged(net, before)
@@ -235,7 +235,7 @@ def test_a_partial_load_writes_the_part_that_it_has(nested):
         (lambda s: s.pop("blocks.widths.1"), {}, "Missing key.*widths.1"),
         (lambda s: s.pop("usage"), {}, "Missing key.*usage"),
         (lambda s: s.update(other=torch.zeros(1)), {}, "Unexpected key.*other"),
-        (lambda s: s.update({"blocks.widths.0": torch.zeros(3, 4)}), {"strict": False}, "shape"),
+        (lambda s: s.update({"blocks.widths.0": torch.zeros(3, 5)}), {"strict": False}, "shape"),
         (lambda s: s.update(traces=torch.zeros(7, 10_000)), {"strict": False}, "traces of 10000"),
         (lambda s: s.update(usage=torch.zeros(59)), {"strict": False}, "usage has the shape"),
         (lambda s: None, {"assign": True}, "leave it out"),
@@ -435,4 +435,4 @@ def test_a_gradient_of_rules_that_are_gone_moves_no_other():
 def test_repr_tells_the_size_and_the_blocks():
     text = repr(network())
     assert "3 inputs, 1 outputs, 60 rules" in text
-    assert text.count("(3, 16), (3, 16), (3, 32)") == 2 and "(1, 16), (1, 16), (1, 32)" in text
+    assert text.count("(3, 4), (3, 12), (3, 48)") == 2 and "(1, 4), (1, 12), (1, 48)" in text

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -168,7 +167,7 @@ def wheel_speeds(steer: float) -> list[float]:
     return [forward - turn, forward + turn]
 
 
-def motion(actions: NDArray[Any]) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
+def motion(actions: NDArray[np.floating]) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
     """How actions move a robot: forward and to the left, each over the fastest. Shapes: (B,).
 
     Args:

@@ -77,14 +77,18 @@ class Criterion(ABC):
 class Rule(Criterion):
     """A rule is added at x when no rule's firing strength reaches theta."""
 
-    def place(self, net, x, squares, log_firing, best):  # noqa: D102
+    def place(  # noqa: D102
+        self, net: "SOFNN", x: Tensor, squares: Tensor, log_firing: Tensor, best: float
+    ) -> Place | None:
         return Place(x) if best < self.log_theta else None
 
 
 class Literal(Criterion):
     """A rule is added at x when no membership of any input reaches theta."""
 
-    def place(self, net, x, squares, log_firing, best):  # noqa: D102
+    def place(  # noqa: D102
+        self, net: "SOFNN", x: Tensor, squares: Tensor, log_firing: Tensor, best: float
+    ) -> Place | None:
         return Place(x) if -0.5 * squares.min().item() < self.log_theta else None
 
 
@@ -97,7 +101,9 @@ class Input(Criterion):
 
     shared = True
 
-    def place(self, net, x, squares, log_firing, best):  # noqa: D102
+    def place(  # noqa: D102
+        self, net: "SOFNN", x: Tensor, squares: Tensor, log_firing: Tensor, best: float
+    ) -> Place | None:
         log_membership, rule = (-0.5 * squares).max(1)
         inputs = torch.arange(len(x), device=x.device)
         is_new = log_membership < self.log_theta
@@ -114,7 +120,9 @@ class Frozen(Criterion):
 
     grows = False
 
-    def place(self, net, x, squares, log_firing, best):  # noqa: D102
+    def place(  # noqa: D102
+        self, net: "SOFNN", x: Tensor, squares: Tensor, log_firing: Tensor, best: float
+    ) -> Place | None:
         return None
 
 

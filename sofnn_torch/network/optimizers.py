@@ -6,6 +6,7 @@ of Adam) belongs to rules column by column, as the parameter itself does, and mo
 
 import weakref
 from collections.abc import Iterator, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -19,8 +20,11 @@ class Followers:
     def __init__(self) -> None:
         self._references: list[weakref.ref[Optimizer]] = []
 
-    def __reduce__(self):
+    def __reduce__(self) -> tuple[Any, ...]:
         return Followers, ()
+
+    def __bool__(self) -> bool:
+        return bool(self._references)
 
     def __iter__(self) -> Iterator[Optimizer]:
         return (o for reference in self._references if (o := reference()) is not None)

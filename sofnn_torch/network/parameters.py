@@ -4,6 +4,8 @@ from typing import Any, NoReturn, Self
 
 from torch import Tensor, nn
 
+KINDS = ("centres", "widths", "consequents")
+
 
 class Window(nn.Parameter):
     """A Parameter that shows columns of the table of the rules. It never gets memory of its own.
@@ -31,9 +33,10 @@ class Window(nn.Parameter):
 
     def show(self, window: Tensor) -> None:
         """Show other memory, of any type and on any device."""
-        nn.Parameter.data.__set__(self, window)
+        # The stubs see a tensor where the class has a descriptor.
+        nn.Parameter.data.__set__(self, window)  # type: ignore[attr-defined]
 
-    def __reduce_ex__(self, protocol):
+    def __reduce_ex__(self, protocol: Any) -> tuple[Any, ...]:
         # A view would be written with all that the table has reserved.
         numbers = self.detach() if self.is_shared() else self.detach().clone()
         return Window, (numbers, self.requires_grad)
@@ -51,12 +54,14 @@ class Blocks(nn.ParameterList):
 
     def pop(self) -> Window:
         """Remove the last window."""
+        last: Window = self[-1]
         self._size -= 1
-        return self._parameters.pop(str(self._size))
+        del self._parameters[str(self._size)]
+        return last
 
     def tensors(self) -> list[Tensor]:
         """The windows, or what `torch.func.functional_call` has put in their places."""
-        return list(self._parameters.values())
+        return list(self._parameters.values())  # type: ignore[arg-type]  # none is None
 
     def register_parameter(self, name: str, param: nn.Parameter | None) -> None:
         """Refuse what is no window at the end, such as the parts of a pruned parameter."""
@@ -79,11 +84,13 @@ class Blocks(nn.ParameterList):
             "pruned or parametrized: write to them in place or use replace_rules()"
         )
 
-    def _save_to_state_dict(self, destination, prefix, keep_vars) -> None:
+    def _save_to_state_dict(
+        self, destination: dict[str, Any], prefix: str, keep_vars: bool
+    ) -> None:
         super()._save_to_state_dict(destination, prefix, keep_vars)
         if not keep_vars:  # torch.save would write all that the table has reserved
             for name in self._parameters:
                 destination[prefix + name] = destination[prefix + name].clone()
 
-    def _load_from_state_dict(self, *arguments) -> None:
+    def _load_from_state_dict(self, *arguments: Any) -> None:
         pass  # the table loads its blocks, all or none

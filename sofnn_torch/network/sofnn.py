@@ -14,6 +14,7 @@ traces and the steps of learning in them are in `sofnn_torch.network.table`.
 
 import math
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -88,7 +89,7 @@ class SOFNN(RuleTable):
         self.criterion, self.growth, self.theta = chosen, chosen.name, chosen.theta
         self.max_firing = 0.0  # at the last state observed
 
-        def per(values, count: int, name: str) -> Tensor:
+        def per(values: float | Sequence[float], count: int, name: str) -> Tensor:
             row = torch.as_tensor(values, dtype=dtype).flatten()
             if len(row) not in (1, count) or not row.isfinite().all():
                 raise ValueError(f"{name} must be one finite number or {count} of them: {values}")
@@ -113,7 +114,8 @@ class SOFNN(RuleTable):
 
     def log_memberships(self, x: Tensor) -> Tensor:
         """Logarithm of equation 1 for x of shape (B, n). Shape: (B, n, K)."""
-        return -0.5 * self._squares(self._states(x), self.part(0), self.part(1))
+        centres, widths, _ = self.joined()
+        return -0.5 * self._squares(self._states(x), centres, widths)
 
     def firing_strengths(self, x: Tensor) -> Tensor:
         """Firing strengths F of equation 2 for x of shape (B, n). Shape: (B, K)."""
@@ -132,7 +134,7 @@ class SOFNN(RuleTable):
         Raises:
             ValueError: a state has another length, or the network has no rules.
         """
-        centres, widths = antecedents or (self.part(0), self.part(1))
+        centres, widths = antecedents or self.joined()[:2]
         x = self._states(x)
         # Compiled or exported there is one way for any number of states.
         if x.dim() == 2 and not torch.compiler.is_compiling() and len(x) >= batches.LARGE:
@@ -170,7 +172,8 @@ class SOFNN(RuleTable):
 
     def forward(self, x: Tensor) -> Tensor:
         """Weighted mean of the consequents (eqs 4, 10) for x of shape (B, n). Shape: (B, m)."""
-        return self.normalised_firing(x) @ self.part(2).T
+        centres, widths, consequents = self.joined()
+        return self.normalised_firing(x, (centres, widths)) @ consequents.T
 
     def conclude(self, firing: Tensor) -> Tensor:
         """Outputs (m,) at a state whose normalised firing (K,) is known."""
@@ -334,7 +337,7 @@ def _normalised(log_firing: Tensor, dtype: torch.dtype) -> Tensor:
     return firing if firing.dtype == dtype else firing.to(dtype)
 
 
-def grid(axes: Sequence[Axis], shape: Sequence[int], n_outputs: int, **settings) -> SOFNN:
+def grid(axes: Sequence[Axis], shape: Sequence[int], n_outputs: int, **settings: Any) -> SOFNN:
     """Fixed-structure twin (FSFNN): a regular grid of rules whose structure is frozen.
 
     Args:

@@ -5,22 +5,22 @@ the rules along the last axis every reduction over inputs is a vectorised sum, t
 faster at batch size 1 than one row per rule. The memory for ``max_rules`` of them is reserved once,
 and an operating system gives what is used of it. So nothing ever moves: the Parameters in
 ``blocks`` are windows into the table, centres, widths and consequents by themselves, and a full
-table appends a block of each that is as large as all before it together.
+table appends a block of each that is three times as large as all before it together.
 """
 
 import copy
-from collections.abc import Mapping, Sequence
-from itertools import accumulate, pairwise
+from collections.abc import Callable, Mapping, Sequence
+from itertools import accumulate, chain, pairwise
 from operator import attrgetter, is_
 from typing import Any, Self
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor, cat, nn
 
+from sofnn_torch.network import loading
 from sofnn_torch.network.optimizers import Followers
-from sofnn_torch.network.parameters import Blocks, Window
+from sofnn_torch.network.parameters import KINDS, Blocks, Window
 
-KINDS = ("centres", "widths", "consequents")
 VERSION = attrgetter("_version")  # counts what is written in place
 STORES = ("table", "traces", "usage", "labels")
 COUNTED = ("traces", "usage", "labels")  # what has a column for each rule beside the parameters
@@ -72,10 +72,16 @@ class RuleStore(nn.Module):
         self.n_inputs, self.n_outputs = n_inputs, n_outputs
         self.max_rules, self.min_width, self.shared = max_rules, min_width, shared
         self.parts = (n_inputs, n_inputs, n_outputs)  # rows of u, v and c in the table
-        self.blocks = nn.ModuleDict({kind: Blocks() for kind in KINDS})
-        self._lists = tuple(self.blocks.values())
+        self._shapes_of_one = [torch.Size((rows,)) for rows in self.parts]
+        self._lists = tuple(Blocks() for _ in KINDS)
+        self.blocks = nn.ModuleDict(dict(zip(KINDS, self._lists, strict=True)))
+        self._windows: list[list[Window]] = [[] for _ in KINDS]
+        self._seen = 0  # versions of the widths
         self._followers, self._is_shared, self._strict = Followers(), False, False
-        self.capacity, self.block_sizes = 0, []  # rules that fit before a block is appended
+        self.capacity = 0  # rules that fit before a block is appended
+        self.block_sizes: list[int] = []
+        self._store: dict[str, Tensor] = {}
+        self.refused: Tensor
         self.register_buffer("refused", torch.tensor(0))
         with torch.inference_mode(False):
             self._reserve(torch.empty(0, dtype=dtype))
@@ -84,21 +90,26 @@ class RuleStore(nn.Module):
 
     # -------------------------------------------------------------------------------------- views
 
-    def part(self, kind: int) -> Tensor:
-        """Centres (0), widths (1) or consequents (2) as rows, differentiable. Shape: (rows, K)."""
-        k, blocks = self.n_rules, self._lists[kind].tensors()
+    def joined(self) -> Sequence[Tensor]:
+        """Centres (n, K), widths (n, K) and consequents (m, K), differentiable.
+
+        Raises:
+            ValueError: there are no rules yet.
+        """
+        k = self.n_rules
         if k == 0:
             raise ValueError("the network has no rules yet: call grow(x) or add_rule(centre)")
-        if all(map(is_, blocks, self._windows[kind])):
+        lists = [blocks.tensors() for blocks in self._lists]
+        # In a functional call others stand in the places of the windows.
+        if all(map(is_, chain(*lists), chain(*self._windows))):
             self._keep_widths()
             if not torch.is_grad_enabled():
-                return self._active_parts[kind]
-        # In a functional call others stand in the places of the windows.
-        return (torch.cat(blocks, 1) if len(blocks) > 1 else blocks[0])[:, :k]
+                return self._active_parts
+        return [(cat(blocks, 1) if len(blocks) > 1 else blocks[0])[:, :k] for blocks in lists]
 
     def table(self) -> Tensor:
         """All parameters of the rules, differentiable. Shape: (2n+m, K)."""
-        return torch.cat([self.part(kind) for kind in range(3)])
+        return cat([*self.joined()])
 
     @property
     def centres(self) -> Tensor:
@@ -152,8 +163,8 @@ class RuleStore(nn.Module):
         """
         if unknown := rates.keys() - set(KINDS):
             raise ValueError(f"there are {', '.join(KINDS)}, not {', '.join(sorted(unknown))}")
-        named = [kind for kind in KINDS if kind in rates]
-        return [{"params": list(self.blocks[kind]), "lr": rates[kind]} for kind in named]
+        lists = zip(KINDS, self._lists, strict=True)
+        return [{"params": list(b), "lr": rates[kind]} for kind, b in lists if kind in rates]
 
     def follow(self, optimizer: torch.optim.Optimizer) -> None:
         """Let an optimizer go on through all changes of structure.
@@ -186,10 +197,11 @@ class RuleStore(nn.Module):
             raise ValueError(f"no memory for max_rules={self.max_rules}: lower it") from None
 
     def _sizes_for(self, count: int) -> list[int]:
-        """Sizes of blocks for so many rules: no block is empty, each new one doubles the room."""
+        """Sizes of blocks for so many rules: no block is empty, each new one makes four of one."""
         sizes = list(self.block_sizes)
         while sum(sizes) < count:
-            sizes.append(min(sum(sizes), self._store["usage"].shape[0] - sum(sizes)))
+            # Few blocks: what autograd does for each costs as much as arithmetic on 1,000 rules.
+            sizes.append(min(3 * sum(sizes), self._store["usage"].shape[0] - sum(sizes)))
             if not sizes[-1]:
                 raise ValueError(f"there is memory for max_rules={sum(sizes)} rules alone")
         while sum(sizes[:-1]) >= count:
@@ -216,7 +228,7 @@ class RuleStore(nn.Module):
         for store in self._store.values():
             store[..., ends[kept] : ends[-1]] = 0
         self.capacity, self.block_sizes = ends[-1], list(sizes)
-        self._windows = [blocks.tensors() for blocks in self._lists]
+        self._windows = [list(blocks) for blocks in self._lists]
         self._seen = self._written()
 
     def _write(self, columns: Mapping[str, Tensor], count: int) -> None:
@@ -268,15 +280,15 @@ class RuleStore(nn.Module):
         """What `repr` shows of the table."""
         return f"{self.n_inputs} inputs, {self.n_outputs} outputs, {self.n_rules} rules"
 
-    def _apply(self, fn, recurse: bool = True) -> Self:
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         """To another type, another device or shared memory: the table, then its windows."""
         self._keep_widths()
         store = {name: fn(values) for name, values in self._store.items()}
         if store["table"].is_meta:
             raise ValueError("the device meta has no numbers: a network cannot be moved there")
-        gradients = [window.grad for windows in self._windows for window in windows]
+        windows = list(chain(*self._windows))
+        gradients = [window.grad for window in windows]
         self._show(store)
-        windows = [window for windows in self._windows for window in windows]
         for window, gradient in zip(windows, gradients, strict=True):
             window.grad = None if gradient is None else fn(gradient)
         super()._apply(fn, recurse=False)
@@ -314,13 +326,17 @@ class RuleStore(nn.Module):
         self._show(self._store)
         self._activate(self.n_rules)
 
-    def _save_to_state_dict(self, destination, prefix, keep_vars) -> None:
+    def _save_to_state_dict(
+        self, destination: dict[str, Any], prefix: str, keep_vars: bool
+    ) -> None:
         self._keep_widths()
         super()._save_to_state_dict(destination, prefix, keep_vars)
         for name in COUNTED:  # torch.save would write all that the stores have reserved
             destination[prefix + name] = getattr(self, name).clone()
 
-    def load_state_dict(self, state_dict, strict: bool = True, assign: bool = False):
+    def load_state_dict(
+        self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False
+    ) -> Any:
         """As for any module; the state of a whole network brings its own number of rules.
 
         A load that is refused changes nothing.
@@ -333,53 +349,31 @@ class RuleStore(nn.Module):
 
     @torch.no_grad()
     def _load_from_state_dict(
-        self, state_dict, prefix, local_metadata, strict, missing, unexpected, errors
+        self,
+        state_dict: Mapping[str, Any],
+        prefix: str,
+        local_metadata: Mapping[str, Any],
+        strict: bool,
+        missing: list[str],
+        unexpected: list[str],
+        errors: list[str],
     ) -> None:
         """Load what is given and fits, or nothing where any of it does not."""
         own = {key[len(prefix) :]: v for key, v in state_dict.items() if key.startswith(prefix)}
         if own and local_metadata.get("assign_to_params_buffers"):
             raise ValueError("load_state_dict(assign=True) would tear the table: leave it out")
-        count, sizes = self.n_rules, self.block_sizes
-        if own.keys() >= {"traces", "blocks.consequents.0"}:
-            count, sizes = own["traces"].shape[-1], _stored_sizes(own)
-        shapes = self._shapes(count, sizes)
-        absent = [name for name in shapes if name not in own]
-        foreign = [name for name in own if name not in shapes]
-        wrong = [
-            f"{prefix}{name} has the shape {tuple(own[name].shape)}, must have {shape}"
-            for name, shape in shapes.items()
-            if name in own and tuple(own[name].shape) != shape
-        ]
-        if not count <= min(sum(sizes), self.max_rules):
-            wrong.append(f"{prefix}traces of {count} rules: must be at most {self.max_rules}")
-        if absent and (count, sizes) != (self.n_rules, self.block_sizes):
-            wrong.append(f"{prefix}traces of {count} rules, not {self.n_rules}: must be whole")
-        missing += [prefix + name for name in absent]
-        unexpected += [prefix + name for name in foreign]
-        errors += wrong
-        if wrong or (self._strict and (absent or foreign)):
+        fit = loading.review(own, self.n_rules, self.block_sizes, self.parts, self.max_rules)
+        missing += [prefix + name for name in fit.absent]
+        unexpected += [prefix + name for name in fit.foreign]
+        errors += [prefix + line for line in fit.wrong]
+        if fit.wrong or (self._strict and (fit.absent or fit.foreign)):
             return
-        self._shape_blocks(sizes)
-        self._activate(count)
-        for name in own.keys() & shapes.keys():
+        self._shape_blocks(fit.sizes)
+        self._activate(fit.rules)
+        for name in own.keys() - set(fit.foreign):
             kind, _, number = name.removeprefix("blocks.").partition(".")
-            target = self.blocks[kind][int(number)].data if number else getattr(self, name)
+            if number:
+                target = self._windows[KINDS.index(kind)][int(number)].data
+            else:
+                target = getattr(self, name)
             target.copy_(own[name])
-
-    def _shapes(self, count: int, sizes: Sequence[int]) -> dict[str, tuple[int, ...]]:
-        """Shape of every tensor in the state of a network with so many rules in such blocks."""
-        shapes: dict[str, tuple[int, ...]] = {
-            f"blocks.{kind}.{i}": (rows, size)
-            for kind, rows in zip(KINDS, self.parts, strict=True)
-            for i, size in enumerate(sizes)
-        }
-        counted = {"traces": (sum(self.parts), count), "usage": (count,), "refused": ()}
-        return shapes | counted | {"labels": (self.n_inputs, count)}
-
-
-def _stored_sizes(state: Mapping[str, Tensor]) -> list[int]:
-    """Rules in each block of a stored network."""
-    sizes: list[int] = []
-    while (block := state.get(f"blocks.consequents.{len(sizes)}")) is not None:
-        sizes.append(block.shape[-1])
-    return sizes

@@ -82,11 +82,10 @@ class RuleTable(RuleStore):
             ValueError: a shape is another, a value is not finite or a width is not positive, or
                 other processes share the memory.
         """
-        shapes = [(*part.shape,) for part in parts]
-        if shapes != [(rows,) for rows in self.parts]:
+        if [part.shape for part in parts] != self._shapes_of_one:
             raise ValueError(
                 f"a rule has {self.n_inputs} centres, {self.n_inputs} widths and "
-                f"{self.n_outputs} consequents, got the shapes {shapes}"
+                f"{self.n_outputs} consequents, got the shapes {[tuple(p.shape) for p in parts]}"
             )
         column = torch.cat(parts).detach()
         k, n, numbers = self.n_rules, self.n_inputs, column.tolist()
@@ -95,8 +94,9 @@ class RuleTable(RuleStore):
         self._check_alone()
         if k == self.capacity:
             self._shape_blocks(self._sizes_for(k + 1))
-        self._followers.clear([windows[-1] for windows in self._windows], k - self.capacity)
-        self._store["table"].select(1, k).copy_(column.detach())
+        if self._followers:
+            self._followers.clear([windows[-1] for windows in self._windows], k - self.capacity)
+        self._store["table"].select(1, k).copy_(column)
         if self.shared:
             fresh = self.labels.amax(1) + 1 if k else 0
             self._store["labels"][:, k] = fresh if labels is None else labels
