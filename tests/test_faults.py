@@ -520,7 +520,7 @@ def test_a_divergence_can_be_played_again(options):
     (file,) = run.glob("divergence-*.pt")
     assert f"trial {checkpoint.load(file)['trial'] + 1} diverged" in str(first.value)
     with pytest.raises(Divergence) as second:
-        training.replay(file)
+        training.play_again(file)
     assert checkpoint.load(file)["reason"] == str(second.value)
     assert str(second.value) in str(first.value)
 
