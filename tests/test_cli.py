@@ -188,7 +188,7 @@ def test_a_learning_rate_of_a_thousand_ends_in_a_message(rate, here, capsys):
 @pytest.mark.parametrize("agent", ["sga", "q"])
 @pytest.mark.parametrize("preset", ["default", "paper"])
 def test_the_presets_stay_within_the_limits_of_the_guard(agent, preset, here, capsys):
-    words = ["--agent", agent, "--preset", preset, "--trials", "3", *QUICK]
+    words = ["--agent", agent, "--preset", preset, "--trials", "2", *QUICK]
     assert main([*words, "--maze.max-steps=2000"]) == 0
     assert not capsys.readouterr().err
 
@@ -433,7 +433,7 @@ def with_value(tree, place, value):
     return {**tree, head: with_value(tree[head], rest, value) if rest else value}
 
 
-@settings(max_examples=600, deadline=None)
+@settings(max_examples=200, deadline=None)
 @given(st.sampled_from(PLACES), plain | st.sampled_from(["sga", "q", "fixed", 0.5, 1, -1, 10**30]))
 @example(("net", "theta"), float("nan"))
 @example(("net", "grid"), [1, 2])
@@ -458,7 +458,7 @@ def test_valid_settings_make_an_agent_or_are_refused_in_one_line(place, value):
         assert "\n" not in str(error)
 
 
-@settings(max_examples=400, deadline=None)
+@settings(max_examples=200, deadline=None)
 @given(st.binary(max_size=60) | plain.map(lambda value: json.dumps({"config": value}).encode()))
 def test_any_config_file_is_refused_in_one_line(data):
     with tempfile.TemporaryDirectory() as directory:
@@ -474,7 +474,7 @@ VALUES = ["q", "sga", "0.5", "3", "-1", "nan", "None", "--", "--quiet", "=", "--
 words = st.sampled_from(FLAGS + VALUES) | st.text(max_size=6)
 
 
-@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(st.lists(words, max_size=4).filter(lambda ws: not {"-h", "--help"} & set(ws)))
 def test_any_arguments_are_parsed_or_refused_in_one_line(arguments):
     try:

@@ -248,7 +248,7 @@ def test_whatever_a_spreadsheet_saves_is_the_same_table_or_refused(sheet, tmp_pa
     rows, table, kind = sheet
     file, outcomes = tmp_path / "rules.csv", {"same": 0, "refused": 0}
 
-    @trials_of(max_examples=400, deadline=None, database=None, suppress_health_check=SLOW)
+    @trials_of(max_examples=150, deadline=None, database=None, suppress_health_check=SLOW)
     @given(saved(rows))
     def attempt(drawn):
         data, slip = drawn
@@ -261,7 +261,7 @@ def test_whatever_a_spreadsheet_saves_is_the_same_table_or_refused(sheet, tmp_pa
             outcomes["refused"] += 1
 
     attempt()
-    assert min(outcomes.values()) > 50, outcomes
+    assert min(outcomes.values()) > 20, outcomes
 
 
 # --------------------------------------------------------------------------------- what is wrong
@@ -501,7 +501,7 @@ def test_broken_files_load_whole_or_not_at_all(few, tmp_path, monkeypatch, suffi
 
     monkeypatch.setattr(rules.Run, "create", create)
 
-    @trials_of(max_examples=1000, deadline=None, database=None, suppress_health_check=SLOW)
+    @trials_of(max_examples=300, deadline=None, database=None, suppress_health_check=SLOW)
     @given(broken(suffix, text))
     def attempt(data):
         rule_file.write_bytes(data)
@@ -520,6 +520,6 @@ def test_broken_files_load_whole_or_not_at_all(few, tmp_path, monkeypatch, suffi
             assert len(str(error).splitlines()) == 1 and len(str(error)) < 400
 
     attempt()
-    assert outcomes["accepted"] and outcomes["refused"] > 200, outcomes
+    assert outcomes["accepted"] and outcomes["refused"] > 60, outcomes
     assert contents(path.parent) == before
     assert [p.name for p in tmp_path.iterdir()] == [rule_file.name]
