@@ -54,7 +54,7 @@ class Flags(Settings):
     """Train several seeds, each in its own process and run: `0-7` or `0,3,5`."""
     workers: Count = 1
     """Seeds that are trained at the same time (with `--seeds`)."""
-    replay: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    again: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Play the trial again that follows a saved state, such as a `divergence-12.pt`."""
 
 
@@ -69,8 +69,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _train(argv: list[str]) -> int:
     flags = parse(argv)
-    if flags.replay:
-        training.replay(flags.replay)
+    if flags.again:
+        training.play_again(flags.again)
         return 0
     if flags.seeds is not None:
         return parallel.train(flags.config, flags.options, flags.seeds, flags.workers, argv)
@@ -150,8 +150,8 @@ def _preset(known: argparse.Namespace) -> Config:
 
 def _keep_settings(flags: Flags, run: Path, base: Config) -> None:
     """Refuse flags that contradict the run to resume."""
-    if flags.seeds is not None or flags.replay:
-        raise ValueError("--resume goes with neither --seeds nor --replay")
+    if flags.seeds is not None or flags.again:
+        raise ValueError("--resume goes with neither --seeds nor --again")
     moved = {"name", "runs"} & set(_changes(flags.options, RunOptions()))
     if moved and home_of(run):
         raise ValueError(f"--{min(moved)} is for new runs; a resumed run keeps its directory")
@@ -166,9 +166,9 @@ def _keep_settings(flags: Flags, run: Path, base: Config) -> None:
 
 def _refuse_idle(flags: Flags, base: Flags) -> None:
     """Refuse flags that change nothing, given the others."""
-    alone = Flags(Config(), RunOptions(), replay=flags.replay)
-    if flags.replay and (others := _changes(flags, alone)):
-        raise ValueError(f"{_flag(others[0])} has no effect with --replay")
+    alone = Flags(Config(), RunOptions(), again=flags.again)
+    if flags.again and (others := _changes(flags, alone)):
+        raise ValueError(f"{_flag(others[0])} has no effect with --again")
     idle = flags.config.idle() | ({} if flags.seeds is not None else {"workers": "without --seeds"})
     for name in _changes(flags, base):
         why = idle.get(name) or idle.get(name.partition(".")[0])

@@ -85,7 +85,7 @@ def check(options: Options) -> None:
     Raises:
         ValueError: naming the flag.
     """
-    if options.video and options.video.suffix not in (".mp4", ".gif"):
+    if options.video and options.video.suffix.lower() not in (".mp4", ".gif"):
         raise ValueError(f"--video must end in .mp4 or .gif, got {options.video}")
     if options.viewer and not has_display():
         raise ValueError("--viewer needs a display: without one use --video FILE")
@@ -261,7 +261,7 @@ def write_video(path: Path, config: Config, agent: Learner, seed: int, explore: 
         OSError: the film cannot be made or written.
     """
     small = {"steps_per_frame": 5, "size": 360} if config.env == MAZE else {}
-    gifs = path.suffix == ".gif"
+    gifs = path.suffix.lower() == ".gif"
     frames = film(config, agent, seed=seed, explore=explore, **(small if gifs else {}))
     checkpoint.write_atomically(path, gif(frames) if gifs else mp4(frames))
 

@@ -6,6 +6,8 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 
+from sofnn_torch.numerals import whole
+
 EVERY = 0.1  # seconds from one redraw of a bar to the next
 LINES = 10  # of progress in a file at most,
 APART = 5.0  # and seconds from one to the next at least
@@ -145,7 +147,7 @@ def say(text: str) -> None:
 def columns() -> int:
     """Columns of the terminal, as the user or the terminal says."""
     with contextlib.suppress(ValueError):
-        if (width := int(os.environ.get("COLUMNS", ""))) > 0:
+        if (width := whole(os.environ.get("COLUMNS", ""))) > 0:
             return width
     with contextlib.suppress(OSError, ValueError, AttributeError):
         if (width := os.get_terminal_size(sys.stderr.fileno()).columns) > 0:

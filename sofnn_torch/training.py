@@ -25,7 +25,7 @@ from sofnn_torch.runs.trial import Recorder, Trajectory, TrialRecord
 from sofnn_torch.streams import output
 from sofnn_torch.terminal import plural, say
 
-__all__ = ["RunOptions", "play", "replay", "resume", "train"]
+__all__ = ["RunOptions", "play", "play_again", "resume", "train"]
 
 
 def play(
@@ -106,7 +106,7 @@ def resume(path: Path | str, options: RunOptions | None = None, trials: int | No
 
 
 @arithmetic()
-def replay(path: Path | str) -> None:
+def play_again(path: Path | str) -> None:
     """Play the trial again that follows a saved state, e.g. that of a divergence.
 
     Raises:
@@ -162,7 +162,7 @@ def _loop(session: Session, options: RunOptions, trap: SignalTrap) -> Path:
         run.save_as(name, session.state | {"reason": str(error)})
         raise Divergence(
             f"trial {number} diverged: {error}; the state before it is in {run.path / name} "
-            "(--replay plays the trial again)"
+            "(--again plays the trial again)"
         ) from error
     except ValueError as error:  # not of the user: settings were checked before the first trial
         raise RuntimeError(f"trial {session.trial + 1} failed: {error}") from error

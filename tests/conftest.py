@@ -5,8 +5,10 @@ from pathlib import Path
 
 import pytest
 import torch
+from hypothesis import HealthCheck
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from sofnn_torch import evaluate, training
 from sofnn_torch.rules import __main__ as rules
 from sofnn_torch.rules import files
 from sofnn_torch.runs import checkpoint
@@ -14,6 +16,7 @@ from sofnn_torch.runs.settings import Config
 from sofnn_torch.training import RunOptions
 
 torch.set_num_threads(1)
+SLOW = [HealthCheck.too_slow, HealthCheck.data_too_large]  # the machine may be busy
 
 
 def settings(agent="sga", network="sofnn", pose="estimated", seed=0, trials=4, **parts) -> Config:
@@ -59,6 +62,15 @@ def call(monkeypatch, capsys):
         return code, *capsys.readouterr()
 
     return run
+
+
+@pytest.fixture(scope="session")
+def few(tmp_path_factory):
+    """A run with few rules: directory, learner, checkpoint, state, settings. Leave it as it is."""
+    config = settings("sga", trials=1, net={"max_rules": 60}, maze={"max_steps": 40})
+    path = training.train(config, quick_options(tmp_path_factory.mktemp("few"), name="run"))
+    config, agent, file, state = evaluate.load(path)
+    return path, agent, file, state, config
 
 
 def contents(folder):

@@ -211,6 +211,7 @@ def test_video_shows_the_maze(trained, tmp_path):
         (["RUN", "--episodes", "0"], "--episodes must be at least 1"),
         (["RUN", "--seed", "-1"], "--seed must not be negative"),
         (["RUN", "--video", "film.avi"], ".mp4 or .gif"),
+        (["RUN", "--video", "mp4"], ".mp4 or .gif"),
         (["RUN", "--json", "nowhere/result.json"], "not a file in an existing directory"),
         (["RUN", "--best"], "best.pt: cannot be read"),
     ],
@@ -360,10 +361,11 @@ def test_the_policy_that_is_named_is_the_one_that_plays_and_is_filmed(
     monkeypatch.setattr(evaluate, "evaluate", evaluated)
     monkeypatch.setattr(evaluate, "film", frames)
     file = tmp_path / "result.json"
-    for suffix in (".mp4", ".gif"):
+    for suffix, form in ((".MP4", b"ftyp"), (".Gif", b"GIF89a")):
         film = tmp_path / f"film{suffix}"
         words = [trained, "--seed", 4, "--episodes", 3, "--json", file, "--video", film]
         assert call(monkeypatch, *words, *flags) == 0
+        assert form in film.read_bytes()[:12]
     assert played == [(3, 4, explore)] * 2 and filmed == [(4, explore)] * 2
     assert f"with {policy} actions" in capsys.readouterr().out
     result = json.loads(file.read_text())

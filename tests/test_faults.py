@@ -184,18 +184,21 @@ def test_a_directory_without_write_permission_is_named_at_the_start(tmp_path):
 def test_a_directory_that_turns_read_only_costs_nothing(tmp_path):
     runs, elsewhere = tmp_path / "runs", tmp_path / "elsewhere"
     elsewhere.mkdir()
-    child = subprocess.Popen(
+    with subprocess.Popen(
         without_privilege("--runs", str(runs), "--trials", "100000"),
         env=os.environ | {"TMPDIR": str(elsewhere), "OMP_NUM_THREADS": "1"},
         stderr=subprocess.PIPE,
         text=True,
-    )
-    wait_for(runs / NAME / "checkpoint-3.pt")
-    (runs / NAME).chmod(0o555)
-    first = child.stderr.readline()
+    ) as child:
+        try:
+            wait_for(runs / NAME / "checkpoint-3.pt")
+            (runs / NAME).chmod(0o555)
+            first = child.stderr.readline()
+            child.send_signal(signal.SIGTERM)
+            _, messages = child.communicate(timeout=300)
+        finally:
+            child.kill()
     assert "Permission denied" in first and "will try again" in first
-    child.send_signal(signal.SIGTERM)
-    _, messages = child.communicate(timeout=300)
     assert child.returncode == 1 and "Traceback" not in messages
     (runs / NAME).chmod(0o755)
     (rescued,) = elsewhere.glob("sofnn-rescue-*/*.pt")
@@ -206,6 +209,22 @@ def test_a_directory_that_turns_read_only_costs_nothing(tmp_path):
     undisturbed = training.train(config, quick_options(tmp_path / "undisturbed"))
     ours, theirs = checkpoint.load(rescued), checkpoint.find_latest(undisturbed)[1]
     assert equal(ours | {"config": theirs["config"]}, theirs)
+
+
+def test_an_old_checkpoint_that_stays_is_no_failure_to_save(
+    options, reference, between_trials, capsys
+):
+    run = options.runs / NAME
+
+    def refuse_removal():  # what is no file cannot be unlinked
+        (run / "checkpoint-1.pt").unlink()
+        (run / "checkpoint-1.pt").mkdir()
+
+    between_trials(before_2=refuse_removal)
+    training.train(settings(), dataclasses.replace(options, keep=1, checkpoint_every=1))
+    same_end(run, reference)
+    assert not warnings(capsys)
+    assert {path.name for path in run.glob("*.pt")} == {"checkpoint-4.pt", "checkpoint-1.pt"}
 
 
 @pytest.mark.parametrize("when", ["before_1", "before_3", "before_4"])
@@ -501,7 +520,7 @@ def test_a_divergence_can_be_played_again(options):
     (file,) = run.glob("divergence-*.pt")
     assert f"trial {checkpoint.load(file)['trial'] + 1} diverged" in str(first.value)
     with pytest.raises(Divergence) as second:
-        training.replay(file)
+        training.play_again(file)
     assert checkpoint.load(file)["reason"] == str(second.value)
     assert str(second.value) in str(first.value)
 

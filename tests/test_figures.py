@@ -156,6 +156,25 @@ def test_learning_curves_are_medians_of_the_common_trials(tmp_path, axes):
         figures.learning_curves({str(i): paths for i in range(6)}, axes)
 
 
+def test_a_column_of_trials_is_read_as_resuming_reads_it(tmp_path):
+    file = tmp_path / "trials.csv"
+    file.write_text("\ufefftrial;steps;success;error\n1;9;True;0,5\n2;8;False;nan\n")
+    assert figures.read_column(file, "success").tolist() == [1, 0]
+    assert figures.read_column(file, "steps").tolist() == [9, 8]
+    assert str(figures.read_column(file, "error").tolist()) == "[0.5, nan]"
+    file.write_text("name,age\nann,3\n")
+    with pytest.raises(ValueError, match=r"trials.csv: its first line is 'name,age'"):
+        figures.read_column(file, "steps")
+
+
+@pytest.mark.parametrize("cell", ["", "1_0", "\u0661", "1e999", "0x1", " 1", "Infinity", "TRUE"])
+def test_only_plain_numbers_are_numbers_of_a_column(cell, tmp_path):
+    file = tmp_path / "trials.csv"
+    file.write_text(f"trial,steps\n1,{cell}\n")
+    with pytest.raises(ValueError, match=r"trials.csv: steps must be a number, got '"):
+        figures.read_column(file, "steps")
+
+
 def test_pose_error_is_in_millimetres_and_marks_the_subgoals(plan, axes):
     true = np.array([[0.15, 0.15, 0], [0.5, 0.15, 0], [0.85, 0.333, 1], [0.5, 0.5, 3]])
     estimated = true + np.array([[0, 0, 0], [0.003, 0.004, 0], [0, 0, 0], [0, -0.002, 0]])

@@ -102,7 +102,7 @@ def open_files():
 
 
 @needs_gl
-@pytest.mark.parametrize("count", [10, pytest.param(100, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [4, pytest.param(100, marks=pytest.mark.slow)])
 def test_many_mazes_that_draw_leave_nothing_behind(count, monkeypatch):
     backend = importlib.import_module(rendering.BACKENDS[rendering.choose_backend()][0])
     opened, freed = [], []

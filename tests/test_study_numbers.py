@@ -50,6 +50,30 @@ def curves(arm, *runs, quantity="steps"):
     ]
 
 
+# ------------------------------------------------------------------------------- reading
+
+
+def test_only_plain_numbers_of_a_table_are_numbers(tmp_path):
+    texts = ["1_0", "\u0661", "1e999", "0x1", "Infinity", "sga-1e3", ""]
+    (tmp_path / "a.csv").write_text("a,b\n-2.5e1,nan\n" + "".join(f"{t},7\n" for t in texts))
+    first, *rest = results.read_table(tmp_path / "a.csv")
+    assert first["a"] == -25 and math.isnan(first["b"])
+    assert rest == [{"a": text, "b": 7} for text in texts]
+    data = results.Data({}, [{"arm": "x", **row} for row in rest], {})
+    assert data.column("x", "b").tolist() == [7] * len(texts)
+    with pytest.raises(ValueError, match="must be a number, got '1_0'"):
+        data.column("x", "a")
+
+
+def test_only_plain_numbers_make_a_curve():
+    rows = [{"arm": "x", "seed": 0, "quantity": "steps", "values": text} for text in ("1 2.5", 7.0)]
+    data = results.Data({}, [], {"curves": [rows[0], rows[1] | {"seed": 1}]})
+    assert [curve.tolist() for curve in data.curves("x", "steps").values()] == [[1, 2.5], [7]]
+    rows[0]["values"] = "1 2_5"
+    with pytest.raises(ValueError, match="must be a number, got '2_5'"):
+        data.curves("x", "steps")
+
+
 # ----------------------------------------------------------------------------- claims, goals
 
 

@@ -62,6 +62,10 @@ FOREIGN = {
     "scientific": (dump(ROWS, delimiter=";").replace("1120", "1.12E+03"), "steps is '1.12E+03'"),
     "a currency": (dump(ROWS, delimiter=";").replace("0.25", "0.25 €"), "statistic is '0.25 €'"),
     "a remark": (dump([*ROWS, ["4", "1", "1", "True", "1", "good"]], delimiter=";"), "4,1,1,True"),
+    "other digits": (
+        dump(ROWS, delimiter=";").replace("95", "\u0669\u0665"),
+        "steps is '\u0669\u0665'",
+    ),
     "open quotes": (OWN.replace("0.25", '"0.25'), "unexpected end of data"),
 }
 
@@ -78,6 +82,13 @@ def test_what_could_mean_anything_is_refused(kind):
 @pytest.mark.parametrize("torn", ["4,99", "4,99,1.0\n", "4,99,0,5,True,0,25\n"])
 def test_lines_of_other_lengths_are_not_of_the_table(torn):
     assert table.read((OWN + torn).encode()) == (OWN.splitlines(keepends=True), "")
+
+
+@pytest.mark.parametrize(
+    ("row", "number"), [("12,5\n", 12), ("\u0661,5\n", 0), ("1_2,5\n", 0), ("9" * 20, 0), (",5", 0)]
+)
+def test_the_trial_of_a_line_is_a_plain_number(row, number):
+    assert table.number(row) == number
 
 
 @pytest.fixture(scope="module")

@@ -5,10 +5,9 @@ import dataclasses
 import json
 import os
 import random
-import subprocess
-import sys
 import threading
 
+import doomed
 import numpy as np
 import psutil
 import pytest
@@ -175,12 +174,11 @@ def test_the_generators_of_the_process_have_no_influence(tmp_path, same_run):
 
 @pytest.mark.parametrize("agent", ["sga", "q"])
 def test_the_number_of_threads_has_no_influence_without_replay(agent, tmp_path, same_run):
-    command = [sys.executable, "-m", "sofnn_torch.cli", "--agent", agent, "--network", "fixed"]
-    command += "--net.grid 16 16 8 --maze.max-steps 120 --trials 2 --quiet".split()  # 2048 rules
-    command += [f"--{agent}.replays", "0"]
-    for threads in ("1", "4"):
-        place = ["--runs", str(tmp_path), "--name", threads, "--threads", threads]
-        subprocess.run(command + place, check=True)
+    parts = {"net": {"grid": (16, 16, 8)}, agent: {"replays": 0}}  # 2048 rules
+    config = settings(agent, "fixed", trials=2, **parts)
+    for threads in (1, 4):
+        options = quick_options(tmp_path, name=str(threads), threads=threads)
+        assert doomed.finish(doomed.start(config, options, tmp_path / str(threads))) == 0
     same_run(tmp_path / "1", tmp_path / "4")
 
 

@@ -69,5 +69,5 @@ class EventFile:
 def _last_stamp(directory: Path) -> float:
     """The latest time in the names of the event files of a directory; 0 if there are none."""
     names = [path.name.removeprefix(PREFIX) for path in directory.glob(f"{PREFIX}*")]
-    found = [re.match(r"\d{1,11}(\.\d{6})?", name) for name in names]
+    found = [re.match(r"[0-9]{1,11}(\.[0-9]{6})?", name) for name in names]
     return max((float(stamp[0]) for stamp in found if stamp), default=0.0)

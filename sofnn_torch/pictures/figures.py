@@ -33,6 +33,8 @@ from numpy.typing import NDArray
 
 from sofnn_torch.learners.learner import Learner
 from sofnn_torch.maze.odometry import motion
+from sofnn_torch.numerals import decimal
+from sofnn_torch.runs.table import read as read_trials
 
 if TYPE_CHECKING:
     from matplotlib.typing import RcKeyType
@@ -367,14 +369,20 @@ def read_column(path: Path, column: str) -> NDArray[np.float64]:
     """One column of a ``trials.csv``; True and False become 1 and 0. Shape: (trials,).
 
     Raises:
-        ValueError: the file has no such column or no trial.
+        ValueError: the file has no such column or no trial, or a cell that is no number.
     """
-    with open(path, newline="") as file:
-        rows = list(csv.DictReader(file))
+    try:
+        rows = list(csv.DictReader(read_trials(path.read_bytes())[0]))
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
     if not rows or column not in rows[0]:
         raise ValueError(f"{path} has no trial with a column {column!r}")
-    words = {"True": "1", "False": "0"}
-    return np.array([float(words.get(row[column], row[column])) for row in rows])
+    words = {"True": 1.0, "False": 0.0, "nan": math.nan, "inf": math.inf, "-inf": -math.inf}
+    cells = [row[column] for row in rows]
+    try:
+        return np.array([words[cell] if cell in words else decimal(cell) for cell in cells])
+    except ValueError as error:
+        raise ValueError(f"{path}: {column} {error}") from None
 
 
 def logarithmic(ax: Axes, subs: Sequence[float] = (1, 2, 3, 5)) -> None:

@@ -29,12 +29,12 @@ from sofnn_torch.learners.learner import Learner
 from sofnn_torch.network.sofnn import SOFNN
 
 VERSION = 2
-HEADER = re.compile(rb"sofnn-torch checkpoint (\d{1,9}) ([0-9a-f]{64})\n")
+HEADER = re.compile(rb"sofnn-torch checkpoint ([0-9]{1,9}) ([0-9a-f]{64})\n")
 HEADER_SIZE = 200  # no header line is longer
 LARGEST = 2**30  # bytes of a file; a million rules take less
 # What a payload is made of; torch would read more, some of which takes memory as it likes.
 BUILT_OF = re.compile(r"torch \w+Storage|torch\._utils _rebuild_tensor_v2|collections OrderedDict")
-NAME = re.compile(r"checkpoint-\d+\.pt")
+NAME = re.compile(r"checkpoint-[0-9]+\.pt")
 ADVICE = "; use an earlier checkpoint"
 KINDS = {
     "config": dict,

@@ -161,6 +161,7 @@ class Run:
                 self._write_table()
             checkpoint.save(self.path / f"checkpoint-{state['trial']}.pt", state)
             self.saved = state["trial"]
+        with contextlib.suppress(OSError):  # the next save drops them
             for old in checkpoint.checkpoints(self.path)[self.keep :]:
                 old.unlink(missing_ok=True)
         return self.saved is not None

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 import torch
 
 from sofnn_torch.bounds import Count, Settings, Within
@@ -133,6 +134,8 @@ def arithmetic(threads: int = 1, portable: bool = False) -> Iterator[None]:
     """
     if portable:
         make_portable()
+    for kind in (np.float32, np.float64):
+        np.finfo(kind)  # remembered; NumPy before 2.4 would warn that it finds no denormal numbers
     flushed, former = bool(torch.tensor(1e-30) * 1e-10 == 0), torch.get_num_threads()
     torch.set_flush_denormal(True)  # first: threads inherit it when they are made
     torch.set_num_threads(threads)

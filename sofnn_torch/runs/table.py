@@ -17,9 +17,9 @@ from sofnn_torch.runs import checkpoint
 from sofnn_torch.runs.trial import TrialRecord
 
 WHOLE = {field.name for field in dataclasses.fields(TrialRecord) if field.type is int}
-WHOLE_NUMBER = re.compile(r"-?\d+")
-DECIMAL_COMMA = re.compile(r"(-?\d+),(\d+(?:[eE][+-]?\d+)?)")
-NUMBER = re.compile(r"-?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?|-?inf|nan|True|False|")
+WHOLE_NUMBER = re.compile(r"-?[0-9]+")
+DECIMAL_COMMA = re.compile(r"(-?[0-9]+),([0-9]+(?:[eE][+-]?[0-9]+)?)")
+NUMBER = re.compile(r"-?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?|-?inf|nan|True|False|")
 SEPARATORS = {",": "", ";": "semicolons", "\t": "tabs"}
 LONGEST = 2**11  # bytes of a line
 LARGEST = 2**28  # bytes of a file
@@ -92,7 +92,7 @@ def line(cells: Iterable[object]) -> str:
 def number(row: str) -> int:
     """The trial of a line, from 1; 0 if it has none."""
     first = row.partition(",")[0]
-    return int(first) if first.isdecimal() and len(first) < 20 else 0
+    return int(first) if re.fullmatch("[0-9]{1,19}", first) else 0
 
 
 def _foreign(text: str) -> tuple[list[str], str]:

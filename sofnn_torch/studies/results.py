@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from sofnn_torch.evaluate import CONFIDENCE, Estimate
+from sofnn_torch.numerals import decimal
 
 
 @dataclass(frozen=True)
@@ -37,7 +38,7 @@ class Data:
 
     def column(self, arm: str, column: str) -> NDArray[np.float64]:
         """A column over the seeds of an arm; empty if the arm has no run."""
-        return np.array([row[column] for row in self.rows if row["arm"] == arm], float)
+        return np.array([_number(row[column]) for row in self.rows if row["arm"] == arm], float)
 
     def diverged(self, *arms: str) -> int:
         """How many runs of the arms diverged."""
@@ -53,7 +54,7 @@ class Data:
         """A quantity of every trial, by the seeds of an arm."""
         rows = self.tables.get("curves", [])
         chosen = [row for row in rows if (row["arm"], row["quantity"]) == (arm, quantity)]
-        return {row["seed"]: np.array(str(row["values"]).split(), float) for row in chosen}
+        return {row["seed"]: _numbers(row["values"]) for row in chosen}
 
 
 def read(out: Path, name: str) -> Data:
@@ -68,14 +69,24 @@ def read(out: Path, name: str) -> Data:
 def read_table(path: Path) -> list[dict[str, Any]]:
     """Rows of a CSV file; what looks like a number is one."""
     with open(path, newline="") as file:
-        return [{k: _number(v) for k, v in row.items()} for row in csv.DictReader(file)]
+        return [{k: _cell(v) for k, v in row.items()} for row in csv.DictReader(file)]
 
 
-def _number(text: str) -> Any:
+def _cell(text: str) -> Any:
     try:
-        return float(text)
+        return _number(text)
     except ValueError:
         return text
+
+
+def _number(cell: Any) -> float:
+    """A number, or the text of one; ``nan`` is what a run that never learned has."""
+    return math.nan if str(cell) == "nan" else decimal(str(cell))
+
+
+def _numbers(cell: Any) -> NDArray[np.float64]:
+    """The numbers in a cell, between blanks."""
+    return np.array([_number(text) for text in str(cell).split()], float)
 
 
 def write_table(path: Path, rows: Sequence[dict[str, Any]]) -> None:
