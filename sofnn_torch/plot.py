@@ -1,0 +1,182 @@
+"""Draw the learning curves of runs, grouped by what differs in their settings.
+
+    python -m sofnn_torch.plot runs/*                          # learning-curves.png and a table
+    python -m sofnn_torch.plot runs --quantity rules --out rules.svg
+    python -m sofnn_torch.plot RUN RUN --smooth 10 --csv curves.csv
+
+Runs that differ in nothing but their seed and their number of trials are one group: a line for the
+median over its seeds, a band from the first to the third quartile, and each seed faintly. The table
+is of the last 10 trials of each run. Runs that are still learning can be drawn.
+"""
+
+import csv
+import dataclasses
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import tyro
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.table import Table
+
+from sofnn_torch.bounds import Count, Settings
+from sofnn_torch.pictures import figures
+from sofnn_torch.runs import checkpoint
+from sofnn_torch.runs.directory import flatten, load_config
+from sofnn_torch.runs.settings import MAZE
+from sofnn_torch.terminal import command, plural
+
+LAST = 10  # trials at the end of each run that the table tells of
+ENDINGS = (".png", ".svg", ".pdf")
+FIRST = ("env", "agent", "network", "pose")  # named first where they differ
+LABELS = {"steps": "steps to the goal", "success": "share of trials that reach the goal"}
+
+
+@dataclass(frozen=True)
+class Options(Settings):
+    """Draw learning curves of runs, and print a table of their last trials."""
+
+    runs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    """Directories of runs, or directories that hold runs."""
+    quantity: str | None = None
+    """Column of trials.csv; by default the steps in the maze and the reward in other tasks."""
+    smooth: Count = 1
+    """Each point is the mean of so many trials, the last ones until there."""
+    out: Path = Path("learning-curves.png")
+    """The picture: a .png, .svg or .pdf file."""
+    csv: Path | None = None
+    """Write the curves to this .csv file: group, run, trial, value."""
+
+
+def find(places: Sequence[Path]) -> list[Path]:
+    """The runs among directories, and those inside directories that are none, each once.
+
+    Raises:
+        ValueError: there is no run.
+    """
+    if not places:
+        raise ValueError("no run: give the directories of runs, such as runs/*")
+    found: dict[Path, Path] = {}
+    for place in places:
+        inside = [place]
+        if place.is_dir() and not (place / "config.json").exists():
+            inside = sorted(p.parent for p in place.glob("[!.]*/config.json"))
+            if not inside:
+                raise ValueError(f"{place} is no run and holds none")
+        found |= {path.resolve(): path for path in inside if path.resolve() not in found}
+    return list(found.values())
+
+
+def group(runs: Sequence[Path]) -> dict[str, list[Path]]:
+    """Runs whose settings are equal but for seed and trials, by what tells the groups apart.
+
+    Raises:
+        ValueError: a directory is no run, or its settings cannot be read.
+    """
+    settings: dict[Path, dict[str, str]] = {}
+    for run in runs:
+        config = load_config(run)
+        flat = flatten(dataclasses.asdict(config))
+        flat = {name: str(value) for name, value in flat.items() if name not in ("seed", "trials")}
+        settings[run] = flat | {"agent": config.learner.name}
+    names = sorted(set().union(*settings.values()), key=lambda name: (name not in FIRST, name))
+    varying = [n for n in names if len({flat.get(n) for flat in settings.values()}) > 1]
+    distinct = len({tuple(sorted(flat.items())) for flat in settings.values()})
+    for count in range(bool(varying), len(varying) + 1):  # as few names as tell all apart
+        labels = {run: _label(flat, varying[:count]) for run, flat in settings.items()}
+        if len(set(labels.values())) == distinct:
+            break
+    groups: dict[str, list[Path]] = {}
+    for run, label in labels.items():
+        groups.setdefault(label, []).append(run)
+    return groups
+
+
+def _label(settings: Mapping[str, str], names: Sequence[str]) -> str:
+    """The settings that tell a group from others; short for those that everybody knows."""
+    known = [settings.get(name, "-") for name in names if name in FIRST]
+    others = [f"{name} {settings.get(name, '-')}" for name in names if name not in FIRST]
+    return ", ".join(known + others) or f"{settings['agent']}, {settings['network']}"
+
+
+def smoothed(values: NDArray[Any], window: int) -> NDArray[Any]:
+    """Means of up to `window` values, the last ones until each. Shape: (T,), as the values."""
+    sums = np.concatenate([[0.0], np.cumsum(values, dtype=float)])
+    ends = np.arange(1, len(values) + 1)
+    starts = np.maximum(ends - window, 0)
+    return (sums[ends] - sums[starts]) / (ends - starts)
+
+
+def summary(curves: Mapping[str, Sequence[NDArray[Any]]], quantity: str) -> Table:
+    """The mean of the last trials of each run: median, least and most over the runs of a group."""
+    table = Table(title=f"{quantity}, mean of the last {LAST} trials of each run")
+    table.add_column("group")
+    for heading in ("runs", "trials", "median", "least", "most"):
+        table.add_column(heading, justify="right")
+    for name, runs in curves.items():
+        ends = [float(curve[-LAST:].mean()) for curve in runs]
+        trials = sorted({len(curve) for curve in runs})
+        numbers = [float(np.median(ends)), min(ends), max(ends)]
+        span = f"{trials[0]:,}" if len(trials) == 1 else f"{trials[0]:,}-{trials[-1]:,}"
+        table.add_row(name, str(len(runs)), span, *(f"{x:,.4g}" for x in numbers))
+    return table
+
+
+def write_table(
+    path: Path, groups: Mapping[str, Sequence[Path]], curves: Mapping[str, Sequence[NDArray[Any]]]
+) -> None:
+    """Write every point of every curve as CSV."""
+    buffer = io.StringIO()
+    rows = csv.writer(buffer, lineterminator="\n")
+    rows.writerow(["group", "run", "trial", "value"])
+    for name, runs in groups.items():
+        for run, curve in zip(runs, curves[name], strict=True):
+            rows.writerows([name, run.name, i, float(v)] for i, v in enumerate(curve, 1))
+    checkpoint.write_atomically(path, buffer.getvalue().encode())
+
+
+def run(options: Options) -> None:
+    """What the command does.
+
+    Raises:
+        ValueError: a run cannot be used or a file cannot be written.
+    """
+    kind = options.out.suffix.lower()
+    if kind not in ENDINGS:
+        raise ValueError(f"--out must end in {', '.join(ENDINGS)}, got {options.out}")
+    if options.csv and options.csv.suffix.lower() != ".csv":
+        raise ValueError(f"--csv must end in .csv, got {options.csv}")
+    for flag, path in (("--out", options.out), ("--csv", options.csv)):
+        if path and (path.is_dir() or not path.parent.is_dir()):
+            raise ValueError(f"{flag} {path}: not a file in an existing directory")
+    groups = group(find(options.runs))
+    first = next(iter(groups.values()))[0]
+    quantity = options.quantity or ("steps" if load_config(first).env == MAZE else "reward")
+    raw = {
+        name: [figures.read_column(path / "trials.csv", quantity) for path in runs]
+        for name, runs in groups.items()
+    }
+    curves = {
+        name: [smoothed(curve, options.smooth) for curve in runs] for name, runs in raw.items()
+    }
+    figure, (ax,) = figures.canvas(width=6, height=3.6)
+    figures.learning_curves(curves, ax, quantity, LABELS.get(quantity, quantity))
+    checkpoint.write_atomically(options.out, figures.saved(figure, kind[1:]))
+    Console().print(summary(raw, quantity))
+    print(f"written: {options.out} ({plural(sum(map(len, groups.values())), 'run')})")
+    if options.csv:
+        write_table(options.csv, groups, curves)
+        print(f"written: {options.csv}")
+
+
+def main() -> None:
+    """Entry point of ``python -m sofnn_torch.plot``."""
+    command(run, Options, __doc__ or "")
+
+
+if __name__ == "__main__":
+    main()
