@@ -497,3 +497,15 @@ def test_pruning_keeps_the_usage_of_the_rest():
     expected = net.usage[keep].tolist()
     net.prune(keep)
     assert net.usage.tolist() == expected and len(expected) > 3
+
+
+def test_usage_is_the_sum_of_the_normalised_firing():
+    net, x = grown(40), states(5, seed=1)
+    before, rules = net.usage.clone(), net.n_rules
+    firing = [net.observe(row) for row in x]
+    expected = before.new_zeros(net.n_rules)
+    expected[:rules] = before
+    for part in firing:
+        expected[: len(part)] += part
+    torch.testing.assert_close(net.usage, expected)
+    assert net.usage.sum() - before.sum() == pytest.approx(5)

@@ -234,3 +234,41 @@ def test_copies_follow_nobody_and_nobody_is_kept_alive():
     assert reference() is None
     while net.n_rules < 40:
         net.add_rule(PLACES[net.n_rules])
+
+
+def test_a_new_rule_has_no_memory_of_the_column_in_which_it_comes():
+    net = network(3, block=4)
+    optimizer = momentum(net.parameters())
+    net.follow(optimizer)
+    for parameter in net.parameters():
+        parameter.grad = torch.ones_like(parameter)  # also where there is no rule yet
+    optimizer.step()
+    blocks = [blocks[0] for blocks in net.blocks.values()]
+    assert all((optimizer.state[b]["momentum_buffer"] == 1).all() for b in blocks)
+    net.add_rule(PLACES[3])
+    for block in blocks:
+        assert not optimizer.state[block]["momentum_buffer"][:, 3].any()
+        assert (optimizer.state[block]["momentum_buffer"][:, :3] == 1).all()
+
+
+def test_nothing_is_remembered_of_a_block_that_is_gone():
+    net = network(12, block=4)
+    optimizer = adam(net.parameters())
+    net.follow(optimizer)
+    learn(net, optimizer, 12)
+    net.prune(torch.arange(12) < 3)
+    assert len(list(net.parameters())) == 3
+    assert {id(p) for p in optimizer.state} == {id(p) for p in net.parameters()}
+
+
+def test_new_blocks_stand_in_the_order_of_the_network():
+    net = network(3, block=4)
+    whole, kinds = momentum(net.parameters()), Adam(net.parameter_groups(**KINDS))
+    for optimizer in (whole, kinds):
+        net.follow(optimizer)
+    for place in PLACES[3:12]:
+        net.add_rule(place)
+    (group,) = whole.param_groups
+    assert [*map(id, group["params"])] == [*map(id, net.parameters())]
+    for group, blocks in zip(kinds.param_groups, net.blocks.values(), strict=True):
+        assert [*map(id, group["params"])] == [*map(id, blocks)] and len(blocks) == 3

@@ -436,3 +436,19 @@ def test_repr_tells_the_size_and_the_blocks():
     text = repr(network())
     assert "3 inputs, 1 outputs, 60 rules" in text
     assert text.count("(3, 4), (3, 12), (3, 48)") == 2 and "(1, 4), (1, 12), (1, 48)" in text
+
+
+def test_a_state_of_more_rules_than_the_network_may_have_is_refused():
+    small, large = network(20, max_rules=20), network(25, max_rules=30)
+    before = numbers(small)
+    with pytest.raises(RuntimeError, match="traces of 25 rules: must be at most 20"):
+        small.load_state_dict(large.state_dict())
+    assert small.n_rules == 20 and all(map(torch.equal, small.parameters(), before))
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda net: pickle.loads(pickle.dumps(net))])
+def test_a_copy_bounds_the_widths_that_were_written_before_it_was_made(copied):
+    net = network()
+    with torch.no_grad():
+        net.blocks["widths"][1][0, 3] = -1.0
+    assert copied(net).widths[4 + 3, 0] == net.min_width

@@ -320,3 +320,15 @@ def test_statistics_are_of_the_decisions_since_the_last_ones():
     assert found["policy/value_mean"] == pytest.approx(sum(values) / 30, rel=1e-5)
     assert found["policy/value_max"] == pytest.approx(max(values), rel=1e-5)
     assert not agent.statistics()
+
+
+def test_the_values_of_wheels_are_named_by_the_wheels_that_they_belong_to():
+    agent = learner("wheels")
+    names = [output.name for output in agent.outputs]
+    right, straight, left = (
+        dict(zip(names[N:], code.tolist(), strict=False)) for code in agent.codes
+    )
+    assert names[N:] == ["c wheel left", "c wheel right", "c"]
+    assert right["c wheel left"] > right["c wheel right"]
+    assert straight["c wheel left"] == straight["c wheel right"]
+    assert left["c wheel left"] < left["c wheel right"]
