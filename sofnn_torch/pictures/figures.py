@@ -32,12 +32,12 @@ from matplotlib.ticker import (
 from numpy.typing import NDArray
 
 from sofnn_torch.learners.learner import Learner
-from sofnn_torch.maze.odometry import motion
+from sofnn_torch.maze.spaces import motion
 
 if TYPE_CHECKING:
     from matplotlib.typing import RcKeyType
 
-    from sofnn_torch.maze.robot import MazePlan
+    from sofnn_torch.maze.plan import MazePlan
     from sofnn_torch.runs.trial import Trajectory
 
 BLUE, ORANGE, GREEN, VERMILION = "#0072B2", "#E69F00", "#009E73", "#D55E00"

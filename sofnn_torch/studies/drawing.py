@@ -10,8 +10,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import StrMethodFormatter
 
+from sofnn_torch.maze.plan import MazePlan
 from sofnn_torch.maze.rendering import OffscreenRenderer, RenderingError
-from sofnn_torch.maze.robot import MazePlan, Physics, load_model
+from sofnn_torch.maze.robot import Physics, load_model
 from sofnn_torch.pictures import figures
 from sofnn_torch.runs.trial import Trajectory
 from sofnn_torch.studies.results import Data
