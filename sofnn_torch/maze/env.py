@@ -356,7 +356,8 @@ class KheperaMazeEnv(gymnasium.Env[np.ndarray, Any]):
         return np.array([*pose, *goal, *self.physics.infrared_ranges(), bumped], dtype=np.float32)
 
     def _info(self, steps: int, bumped: bool, success: bool) -> dict[str, Any]:
-        return {
+        goal = {"goal": np.array(self.plan.goals[self.goal])} if self.plan.told else {}
+        return goal | {
             "steps": steps,
             "total_steps": self.total_steps,
             "collision": bumped,
