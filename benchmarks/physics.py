@@ -18,9 +18,10 @@ import mujoco
 import numpy as np
 from timing import arguments, median, ratio, report
 
+from sofnn_torch.maze.layouts import standard_path
 from sofnn_torch.maze.odometry import MotorNoise, wrap_angle
 from sofnn_torch.maze.optimum import optimal_steps
-from sofnn_torch.maze.robot import Physics, default_model_path
+from sofnn_torch.maze.robot import Physics
 
 STRAIGHT, LEFT, RIGHT = (0.010, 0.010), (-0.004, 0.004), (0.004, -0.004)
 Change = Callable[[mujoco.MjSpec], None]
@@ -64,7 +65,7 @@ class Variant:
 
     def build(self) -> "Robot":
         """Compile the model."""
-        spec = mujoco.MjSpec.from_file(str(default_model_path()))
+        spec = mujoco.MjSpec.from_file(str(standard_path()))
         spec.compiler.discardvisual = not self.drawn
         self.change(spec)
         robot = Robot(spec.compile())

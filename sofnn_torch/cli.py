@@ -158,6 +158,7 @@ def _keep_settings(flags: Flags, run: Path, base: Config) -> None:
     asked = dataclasses.replace(flags.config, trials=base.trials)
     for name in _changes(asked, base):
         ours, theirs = (directory.flatten(dataclasses.asdict(c))[name] for c in (asked, base))
+        ours, theirs = directory.brief(ours), directory.brief(theirs)
         raise ValueError(
             f"{_flag(name)} {ours} contradicts {run}, which has {theirs}: "
             "a run keeps its settings; only --trials may be raised"

@@ -31,7 +31,7 @@ from scipy import stats
 
 from sofnn_torch.bounds import Count, Settings, Within
 from sofnn_torch.learners.learner import Learner
-from sofnn_torch.maze.optimum import optimal_steps
+from sofnn_torch.maze.optimum import mean_optimum
 from sofnn_torch.maze.rendering import has_display
 from sofnn_torch.pictures.film import film, gif, mp4
 from sofnn_torch.progress import Progress
@@ -267,10 +267,10 @@ def write_video(path: Path, config: Config, agent: Learner, seed: int, explore: 
 
 
 def optimum(config: Config) -> float | None:
-    """Steps of the best noise-free run through the maze; None for other tasks."""
+    """Steps of the best noise-free run through the maze, in the mean; None for other tasks."""
     if config.env != MAZE:
         return None
-    return optimal_steps(make_plan(config), config.maze.hold).steps
+    return mean_optimum(make_plan(config), config.maze.hold)
 
 
 @arithmetic()

@@ -10,7 +10,7 @@ import torch
 from matplotlib.patches import Rectangle
 from PIL import Image
 
-from sofnn_torch.maze.odometry import motion
+from sofnn_torch.maze.spaces import motion
 from sofnn_torch.pictures import figures
 from sofnn_torch.runs.factory import make_agent, make_env
 from sofnn_torch.runs.settings import Config

@@ -11,8 +11,8 @@ import pytest
 import torch
 
 from sofnn_torch.maze.env import LEFT, RIGHT, STRAIGHT, KheperaMazeEnv
+from sofnn_torch.maze.layouts import standard_path
 from sofnn_torch.maze.odometry import FORWARD_SPEED, pose_errors
-from sofnn_torch.maze.robot import default_model_path
 from sofnn_torch.runs.factory import make_env
 from sofnn_torch.runs.settings import Config
 
@@ -269,7 +269,7 @@ def test_a_restored_trial_that_was_over_is_over():
           for part in ("radius", "base")),
         ("range_sensors", [None, 1, "yes", np.array([True, False])]),
         ("render_mode", ["ansi", 1, np.array(["human"])]),
-        ("model_path", ["no/such/file.xml", 5, b"maze.xml", [], __file__]),
+        ("layout", ["no/such/file.xml", 5, b"maze.xml", [], None, __file__, "rooms\0", "random:x"]),
         ("camera", ["side", None, 0]),
         ("speed", [0.0, -1, math.inf, None, "20"]),
         ("width", [0, -1, 2.5, 9000, None, "480", math.nan]),
@@ -278,7 +278,7 @@ def test_a_restored_trial_that_was_over_is_over():
 )  # fmt: skip
 def test_impossible_settings_are_refused_in_one_line_that_names_them(name, values):
     for value in values:
-        with pytest.raises(ValueError, match=name if name != "model_path" else "MJCF") as error:
+        with pytest.raises(ValueError, match=name) as error:
             KheperaMazeEnv(**{name: value})
         assert "\n" not in str(error.value) and len(str(error.value)) < 200, value
 
@@ -311,22 +311,22 @@ def test_scalars_of_numpy_are_taken_as_numbers():
     ],
 )
 def test_a_model_that_lacks_an_element_is_refused(change, message, tmp_path):
-    spec = mujoco.MjSpec.from_file(str(default_model_path()))
+    spec = mujoco.MjSpec.from_file(str(standard_path()))
     change(spec)
     path = tmp_path / "maze.xml"
     path.write_text(spec.to_xml())
     with pytest.raises(ValueError, match=f"lacks an element.*{message}") as error:
-        KheperaMazeEnv(model_path=path)
+        KheperaMazeEnv(layout=path)
     assert "\n" not in str(error.value) and len(str(error.value)) < 200
 
 
 def test_a_maze_without_subgoals_is_a_maze(tmp_path):
-    spec = mujoco.MjSpec.from_file(str(default_model_path()))
+    spec = mujoco.MjSpec.from_file(str(standard_path()))
     for name in ("subgoal_1", "subgoal_2"):
         spec.delete(spec.site(name))
     path = tmp_path / "maze.xml"
     path.write_text(spec.to_xml())
-    env = KheperaMazeEnv(model_path=path)
+    env = KheperaMazeEnv(layout=path)
     env.reset(seed=0)
     assert env.step(STRAIGHT)[4]["subgoals"].shape == (0,)
 
@@ -400,11 +400,13 @@ def test_inputs_and_actions_have_names_and_ranges():
 
 
 def test_the_ranges_are_those_of_the_plan(tmp_path):
-    spec = mujoco.MjSpec.from_file(str(default_model_path()))
+    spec = mujoco.MjSpec.from_file(str(standard_path()))
     spec.geom("wall_north").pos[1] += 0.5
+    for side in ("west", "east"):
+        spec.geom(f"wall_{side}").size[1] += 0.5
     path = tmp_path / "maze.xml"
     path.write_text(spec.to_xml())
-    x, y, _ = KheperaMazeEnv(model_path=path).axes
+    x, y, _ = KheperaMazeEnv(layout=path).axes
     assert (x.high, y.high) == (1.0, 1.5)
 
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from sofnn_torch.maze.env import LEFT, RIGHT, STRAIGHT, KheperaMazeEnv
+from sofnn_torch.maze.layouts import standard_path
 from sofnn_torch.maze.odometry import (
     DRAG,
     FORWARD_SPEED,
@@ -15,12 +16,11 @@ from sofnn_torch.maze.odometry import (
     MotorNoise,
     advance,
     differential_drive,
-    motion,
     slide,
-    wheel_speeds,
     wrap_angle,
 )
-from sofnn_torch.maze.robot import Physics, default_model_path
+from sofnn_torch.maze.robot import Physics
+from sofnn_torch.maze.spaces import motion, wheel_speeds
 
 QUARTER = 0.5 * math.pi
 
@@ -245,7 +245,7 @@ def test_encoders_see_the_motor_noise_that_commands_do_not():
 @pytest.fixture
 def open_field(tmp_path):
     """An MJCF of the robot in a 10 m x 10 m arena without inner walls."""
-    spec = mujoco.MjSpec.from_file(str(default_model_path()))
+    spec = mujoco.MjSpec.from_file(str(standard_path()))
     spec.delete(spec.geom("wall_lower"))
     spec.delete(spec.geom("wall_upper"))
     for name, x, y in (("south", 5, -5), ("north", 5, 15), ("west", -5, 5), ("east", 15, 5)):
@@ -258,7 +258,7 @@ def open_field(tmp_path):
 
 def drift(path, runs):
     """Return position [mm] and heading [rad] errors after 510 collision-free steps."""
-    env = KheperaMazeEnv(model_path=path)
+    env = KheperaMazeEnv(layout=path)
     env.reset(seed=0)
     rng = np.random.default_rng(0)
     errors = []

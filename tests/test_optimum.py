@@ -11,7 +11,8 @@ import pytest
 from sofnn_torch.maze import optimum
 from sofnn_torch.maze.env import KheperaMazeEnv
 from sofnn_torch.maze.optimum import STEP_LENGTH, STEP_TURN, optimal_steps
-from sofnn_torch.maze.robot import MazePlan, Physics
+from sofnn_torch.maze.plan import MazePlan
+from sofnn_torch.maze.robot import Physics
 
 SKIN = 0.001 - 0.0004  # m, kept from walls, less the error of the grid that says where they are
 
@@ -33,8 +34,8 @@ def room(start, goal, walls=()):
     return MazePlan(
         size=(1.0, 1.0),
         walls=[south, north, west, east, *walls],
-        start=start,
-        goal=goal,
+        starts=[start],
+        goals=[goal],
         goal_radius=0.06,
         subgoals=[],
         subgoal_radius=0.08,

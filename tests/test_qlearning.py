@@ -11,7 +11,7 @@ from scipy import stats
 
 from sofnn_torch.learners.learner import Task
 from sofnn_torch.learners.qlearning import QConfig, QLearning
-from sofnn_torch.maze.odometry import wheel_speeds
+from sofnn_torch.maze.spaces import wheel_speeds
 from sofnn_torch.network.axes import Axis
 from sofnn_torch.network.sofnn import SOFNN
 

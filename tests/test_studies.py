@@ -425,9 +425,7 @@ def test_a_report_can_be_written_again(written, tmp_path, monkeypatch):
 
 def test_data_of_runs_become_a_page(tmp_path, monkeypatch):
     runs, out = tmp_path / "runs", tmp_path / "out"
-    monkeypatch.setattr(
-        command, "optimal_steps", lambda plan: dataclasses.make_dataclass("O", ["steps"])(OPTIMUM)
-    )
+    monkeypatch.setattr(command, "mean_optimum", lambda plan: OPTIMUM)
     options = {"study": ("growth",), "arms": "sga-rule", "seeds": "0-1", "trials": 2}
     options |= {"max_steps": 30, "runs": runs, "out": out}
     for work in running.plan(

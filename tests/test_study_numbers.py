@@ -161,7 +161,7 @@ def test_resets_count_where_the_error_ends_at_both_subgoals(errors, twice, monke
     plan = claims.Physics().plan
     path = through(plan.subgoals, errors)
     monkeypatch.setattr(claims, "last_paths", lambda data, arm: {0: path})
-    assert claims.resets(None, "arm") == (twice, 1, pytest.approx(0.05))
+    assert claims.resets(SimpleNamespace(layout="s"), "arm") == (twice, 1, pytest.approx(0.05))
     data = study({"sga-sofnn-estimated": {}})
     measured = {claim[:7]: text for claim, _, text, _ in claims.claims(data)}
     assert measured["Fig. 11"] == f"{twice} of 1 paths; largest error 50 mm (median)"

@@ -16,8 +16,8 @@ from tensorboard.compat.proto.summary_pb2 import Summary
 from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
 
 from sofnn_torch.maze.env import KheperaMazeEnv
+from sofnn_torch.maze.layouts import standard_path
 from sofnn_torch.maze.rendering import RenderingError
-from sofnn_torch.maze.robot import default_model_path
 from sofnn_torch.pictures import events as events_module
 from sofnn_torch.pictures import film as film_module
 from sofnn_torch.pictures.events import EventFile
@@ -256,7 +256,7 @@ def test_a_film_of_a_robot_that_does_not_arrive_ends(sga_trial, monkeypatch):
 
 def test_a_film_shows_the_maze_that_the_robot_is_in(sga_trial, monkeypatch, tmp_path):
     config, agent, _, _ = sga_trial
-    spec = mujoco.MjSpec.from_file(str(default_model_path()))
+    spec = mujoco.MjSpec.from_file(str(standard_path()))
     spec.delete(spec.geom("wall_lower"))
     path = tmp_path / "maze.xml"
     path.write_text(spec.to_xml())
@@ -268,7 +268,7 @@ def test_a_film_shows_the_maze_that_the_robot_is_in(sga_trial, monkeypatch, tmp_
             super().__init__(model, *size)
 
     monkeypatch.setattr(film_module, "OffscreenRenderer", Screen)
-    monkeypatch.setattr(film_module, "make_maze", lambda _: KheperaMazeEnv(model_path=path))
+    monkeypatch.setattr(film_module, "make_maze", lambda _: KheperaMazeEnv(layout=path))
     next(film(config, agent))
     assert "wall_upper" in shown[0] and "wall_lower" not in shown[0]
 

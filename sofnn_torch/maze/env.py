@@ -1,8 +1,6 @@
 """The Khepera in its maze as a Gymnasium environment: decisions, rewards, pose estimates."""
 
-import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,22 +11,30 @@ from sofnn_torch.maze.arguments import choice, real, show, vector, whole
 from sofnn_torch.maze.odometry import (
     FORWARD_SPEED,
     STEP_SECONDS,
-    TURN_SPEED,
     WHEEL_BASE,
     DeadReckoning,
     MotorNoise,
     Pose,
     pose_errors,
 )
+from sofnn_torch.maze.plan import MazePlan
 from sofnn_torch.maze.rendering import OffscreenRenderer
-from sofnn_torch.maze.robot import INFRARED_RANGE, MazePlan, Physics, load_model
-from sofnn_torch.maze.settings import ACTION_NAMES, POSE, MazeConfig
+from sofnn_torch.maze.robot import Physics, checked, load_model
+from sofnn_torch.maze.settings import MazeConfig, axes
+from sofnn_torch.maze.spaces import (
+    ACTION_NAMES,
+    LEFT,
+    RIGHT,
+    STRAIGHT,
+    action_space,
+    commanded,
+    observation_space,
+)
 from sofnn_torch.maze.viewer import Viewer
 from sofnn_torch.network.axes import Axis
 
-__all__ = ["KheperaMazeEnv", "MazePlan", "Physics"]
+__all__ = ["LEFT", "RIGHT", "STRAIGHT", "KheperaMazeEnv", "MazePlan", "Physics"]
 
-RIGHT, STRAIGHT, LEFT = range(3)
 MAX_HOLD = 10_000  # steps; motor noise is drawn for a whole decision at once
 START, GOAL = -2, -1  # zones; the others are the numbers of sub-goals
 
@@ -57,6 +63,7 @@ class KheperaMazeEnv(gymnasium.Env[np.ndarray, Any]):
     def __init__(
         self,
         pose: str = "estimated",
+        layout: str | Path = MazeConfig.layout,
         actions: str = MazeConfig.actions,
         hold: int = MazeConfig.hold,
         max_steps: int = MazeConfig.max_steps,
@@ -71,7 +78,6 @@ class KheperaMazeEnv(gymnasium.Env[np.ndarray, Any]):
         wheel_base_scale: float = MazeConfig.wheel_base_scale,
         range_sensors: bool = False,
         render_mode: str | None = None,
-        model_path: str | Path | None = None,
         camera: str = "top",
         width: int = 480,
         height: int = 480,
@@ -81,6 +87,7 @@ class KheperaMazeEnv(gymnasium.Env[np.ndarray, Any]):
 
         Args:
             pose: "estimated", "odometry" or "true": what the observation holds.
+            layout: a maze that is built in, a file or the text of a map or an MJCF, see `layouts`.
             actions: "three", "steer" or "wheels".
             hold: simulator steps for which an action is held.
             max_steps: trial limit in simulator steps.
@@ -95,7 +102,6 @@ class KheperaMazeEnv(gymnasium.Env[np.ndarray, Any]):
             wheel_base_scale: wheel base that dead reckoning believes, over the true one.
             range_sensors: add 8 infrared ranges and the bumper to the observation.
             render_mode: None, "rgb_array" or "human".
-            model_path: another MJCF with the element names of the standard one.
             camera: "top" or "chase".
             width: of the picture in pixels.
             height: of the picture in pixels.
@@ -113,8 +119,8 @@ class KheperaMazeEnv(gymnasium.Env[np.ndarray, Any]):
         if not isinstance(range_sensors, bool | np.bool_):
             raise ValueError(f"range_sensors must be True or False, not {show(range_sensors)}")
 
-        self.physics = Physics(model_path)
-        self.model_path = model_path
+        self.layout = checked("layout", layout)
+        self.physics = Physics(self.layout)
         self.camera, self.width, self.height = self.physics.check_view(camera, width, height)
         self.plan = plan = self.physics.plan
         self.speed = real("speed", speed)
@@ -133,15 +139,12 @@ class KheperaMazeEnv(gymnasium.Env[np.ndarray, Any]):
         self.step_reward = real("step_reward", step_reward)
         self.wheel_radius_scale = float(wheel_radius_scale)
         self.range_sensors = bool(range_sensors)
-        self.action_space = {
-            "three": gymnasium.spaces.Discrete(3),
-            "steer": gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float32),
-            "wheels": gymnasium.spaces.Box(-1.0, 1.0, (2,), np.float32),
-        }[actions]
-        self.observation_space = self._build_observation_space()
-        zones = [(i, centre, plan.subgoal_radius) for i, centre in enumerate(plan.subgoals)]
-        zones += [(START, plan.start[:2], plan.start_radius), (GOAL, plan.goal, plan.goal_radius)]
-        self._zones = [(zone, (*centre, radius * radius)) for zone, centre, radius in zones]
+        self.action_space = action_space(actions)
+        # Without its guard an estimate may leave the arena, by at most what a trial can drive.
+        free = pose != "true" and not self.estimator.guarded
+        reach = self.max_steps * STEP_SECONDS * FORWARD_SPEED * self.wheel_radius_scale * free
+        self.observation_space = observation_space(plan, reach, self.range_sensors)
+        self._aim(0)
 
         self.trial = self.decision = 0  # numbers that the window shows
         self.caption = ""  # what it shows beside them, e.g. the rule that decides
@@ -162,6 +165,8 @@ class KheperaMazeEnv(gymnasium.Env[np.ndarray, Any]):
         """
         super().reset(seed=seed)
         pose = self._start_pose(options or {})
+        if self.plan.told:
+            self._aim(int(self.np_random.integers(len(self.plan.goals))))
         self.physics.place(pose)
         self.estimator.fix(pose)
         self.trial, self.decision, self.caption = self.trial + 1, 0, ""
@@ -201,19 +206,7 @@ class KheperaMazeEnv(gymnasium.Env[np.ndarray, Any]):
 
     def wheel_speeds(self, action: Any) -> tuple[float, float]:
         """Return the commanded speeds of the left and right wheel [m/s] for an action."""
-        if self.actions == "three":
-            (number,) = vector("action", action, 1)
-            if number not in (RIGHT, STRAIGHT, LEFT):
-                names = f"{RIGHT} (right), {STRAIGHT} (straight), {LEFT} (left turn)"
-                raise ValueError(f"action must be {names}, not {show(action)}")
-            steer = number - 1.0
-        else:
-            values = vector("action", action, len(self.action_names), bound=1.0)
-            if self.actions == "wheels":
-                return values[0] * FORWARD_SPEED, values[1] * FORWARD_SPEED
-            steer = values[0]
-        forward, turn = FORWARD_SPEED * (1.0 - abs(steer)), TURN_SPEED * steer
-        return forward - turn, forward + turn
+        return commanded(self.actions, action)
 
     def render(self) -> np.ndarray | None:
         """Return the view of the maze as an RGB array (height, width, 3), or update the window.
@@ -228,24 +221,21 @@ class KheperaMazeEnv(gymnasium.Env[np.ndarray, Any]):
             return None
         qpos, estimate = self.physics.data.qpos, self.estimator.pose
         if self._renderer is None:
-            model = load_model(self.model_path)
+            model = load_model(self.layout)
             if self.render_mode == "human":
                 self._renderer = Viewer(model, self.speed, self.camera)
             else:
                 self._renderer = OffscreenRenderer(model, self.width, self.height)
         if isinstance(self._renderer, Viewer):
-            self._renderer.draw(qpos, self.trail, estimate, self._texts())
+            texts = {
+                "trial": f"{self.trial}",
+                "time": f"{self.physics.data.time:.1f} s",
+                "decision": f"{self.decision}",
+            }
+            texts |= {"rule": self.caption} if self.caption else {}
+            self._renderer.draw(qpos, self.trail, estimate, texts)
             return None
         return self._renderer.draw(qpos, self.trail, estimate, self.camera)
-
-    def _texts(self) -> dict[str, str]:
-        seconds = self.physics.data.time
-        texts = {
-            "trial": f"{self.trial}",
-            "time": f"{seconds:.1f} s",
-            "decision": f"{self.decision}",
-        }
-        return texts | ({"rule": self.caption} if self.caption else {})
 
     def close(self) -> None:
         """Free the renderer or close the viewer window."""
@@ -255,10 +245,8 @@ class KheperaMazeEnv(gymnasium.Env[np.ndarray, Any]):
 
     @property
     def axes(self) -> tuple[Axis, ...]:
-        """What the first three observations are: x, y and heading, with their ranges."""
-        width, height = self.plan.size
-        x, y, heading = POSE
-        return replace(x, high=width), replace(y, high=height), heading
+        """What the first observations are: x, y and heading, and the goal where that varies."""
+        return axes(self.plan)
 
     @property
     def action_names(self) -> tuple[str, ...]:
@@ -287,7 +275,8 @@ class KheperaMazeEnv(gymnasium.Env[np.ndarray, Any]):
 
     def state_dict(self) -> dict[str, Any]:
         """Return the full state as plain numbers and lists; from it the future is bit-identical."""
-        return {
+        goal = {"goal": self.goal} if self.plan.told else {}
+        return goal | {
             "physics": self.physics.state(),
             "generator": self.np_random.bit_generator.state,
             "estimate": list(self.estimator.pose),
@@ -305,6 +294,7 @@ class KheperaMazeEnv(gymnasium.Env[np.ndarray, Any]):
         self.done = state["done"]
         self.subgoals = list(state["subgoals"])
         self.trail = [self.physics.position()]
+        self._aim(state.get("goal", 0))
 
     def _simulate(
         self, left: float, right: float, first: float, second: float
@@ -338,6 +328,15 @@ class KheperaMazeEnv(gymnasium.Env[np.ndarray, Any]):
             self.on_simulator_step()
         return reward, bumped, success
 
+    def _aim(self, goal: int) -> None:
+        """Let a goal be that of the trial, beside the others unless the robot is told which."""
+        self.goal, plan = goal, self.plan
+        goals = [plan.goals[goal]] if plan.told else plan.goals
+        zones = [(i, centre, plan.subgoal_radius) for i, centre in enumerate(plan.subgoals)]
+        zones += [(START, start[:2], plan.start_radius) for start in plan.starts]
+        zones += [(GOAL, centre, plan.goal_radius) for centre in goals]
+        self._zones = [(zone, (*at, r * r)) for zone, at, r in zones if r > 0.0]
+
     def _enter(self, zone: int) -> float:
         """Return the reward inside a zone; correct the estimate at landmarks."""
         if zone == GOAL:
@@ -351,12 +350,14 @@ class KheperaMazeEnv(gymnasium.Env[np.ndarray, Any]):
 
     def _observation(self, bumped: bool) -> np.ndarray:
         pose = self.physics.pose() if self.pose_mode == "true" else self.estimator.pose
+        goal = self.plan.goals[self.goal] if self.plan.told else ()
         if not self.range_sensors:
-            return np.array(pose, dtype=np.float32)
-        return np.array([*pose, *self.physics.infrared_ranges(), bumped], dtype=np.float32)
+            return np.array([*pose, *goal], dtype=np.float32)
+        return np.array([*pose, *goal, *self.physics.infrared_ranges(), bumped], dtype=np.float32)
 
     def _info(self, steps: int, bumped: bool, success: bool) -> dict[str, Any]:
-        return {
+        goal = {"goal": np.array(self.plan.goals[self.goal])} if self.plan.told else {}
+        return goal | {
             "steps": steps,
             "total_steps": self.total_steps,
             "collision": bumped,
@@ -367,26 +368,13 @@ class KheperaMazeEnv(gymnasium.Env[np.ndarray, Any]):
             "estimated_pose": np.array(self.estimator.pose),
         }
 
-    def _build_observation_space(self) -> gymnasium.spaces.Box:
-        # Without its guard an estimate may leave the arena, by at most what a trial can drive.
-        free = self.pose_mode != "true" and not self.estimator.guarded
-        reach = self.max_steps * STEP_SECONDS * FORWARD_SPEED * self.wheel_radius_scale * free
-        low = [-reach, -reach, -math.pi]
-        high = [self.plan.size[0] + reach, self.plan.size[1] + reach, math.pi]
-        if self.range_sensors:
-            low += [0.0] * 9
-            high += [INFRARED_RANGE] * 8 + [1.0]
-        return gymnasium.spaces.Box(
-            np.array(low, np.float32), np.array(high, np.float32), dtype=np.float32
-        )
-
     def _start_pose(self, options: dict[str, Any]) -> Pose:
         unknown = set(options) - {"pose"}
         if unknown:
             raise ValueError(f'unknown reset options {sorted(unknown)}: only "pose" is known')
-        x, y, heading = vector("the reset pose", options.get("pose", self.plan.start), 3)
-        width, height = self.plan.size
-        inside = 0.0 < x < width and 0.0 < y < height
-        if not inside or self.plan.clearance(x, y) < 0.0:
+        if "pose" not in options:
+            return self.plan.draw_start(self.np_random)
+        x, y, heading = vector("the reset pose", options["pose"], 3)
+        if not self.plan.has_room(x, y):
             raise ValueError(f"the robot cannot be put at {(x, y)}: a wall is there")
         return x, y, heading

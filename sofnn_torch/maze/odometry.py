@@ -15,7 +15,6 @@ WHEEL_BASE = 0.050  # m, distance between the wheels
 WHEEL_RADIUS = 0.008  # m
 STEP_LENGTH = FORWARD_SPEED * STEP_SECONDS  # m, one step straight on: 5 mm
 STEP_TURN = 2.0 * TURN_SPEED * STEP_SECONDS / WHEEL_BASE  # rad, one turning step: 0.08 rad
-TURN_SHARE = TURN_SPEED / FORWARD_SPEED  # wheel speed of a turn over that of going straight
 DRAG = 1.7  # sideways drag of the tyres over that of the drive, of the simulated robot
 
 Pose = tuple[float, float, float]
@@ -159,25 +158,6 @@ def slide(distance: float, walls: Sequence[float]) -> tuple[float, float]:
             resistance = share + DRAG * (1.0 - share)
             along, aside = along / resistance, aside / resistance
     return along, aside
-
-
-def wheel_speeds(steer: float) -> list[float]:
-    """Speeds of the left and right wheel over the fastest, of a steering from -1 to 1."""
-    forward, turn = 1 - abs(steer), TURN_SHARE * steer
-    return [forward - turn, forward + turn]
-
-
-def motion(actions: NDArray[np.floating]) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
-    """How actions move a robot: forward and to the left, each over the fastest. Shapes: (B,).
-
-    Args:
-        actions: numbers of the three actions (B,), steering (B, 1) or wheel speeds (B, 2).
-    """
-    if actions.ndim == 2 and actions.shape[1] == 2:
-        left, right = actions.T
-        return (left + right) / 2, ((right - left) / (2 * TURN_SHARE)).clip(-1, 1)
-    steer = actions - 1.0 if actions.ndim == 1 else actions[:, 0]
-    return 1 - abs(steer), steer
 
 
 def pose_errors(true: NDArray[np.float64], estimated: NDArray[np.float64]) -> dict[str, float]:

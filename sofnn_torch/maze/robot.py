@@ -1,16 +1,17 @@
 """The simulated Khepera: the MJCF as a robot that drives and answers questions."""
 
+import functools
 import math
-from dataclasses import dataclass
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
 
-from sofnn_torch.maze.arguments import choice, show, whole
+from sofnn_torch.maze.arguments import choice, whole
+from sofnn_torch.maze.layouts import STANDARD, content, mjcf
 from sofnn_torch.maze.odometry import STEP_SECONDS, WHEEL_RADIUS, Pose, wrap_angle
+from sofnn_torch.maze.plan import MazePlan, heading_of
 
 INFRARED = (
     "ir_left_90",
@@ -26,101 +27,34 @@ INFRARED_RANGE = 0.1  # m
 STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 
 
-def default_model_path() -> Path:
-    """Return the maze's MJCF, from the installed package or the checkout around it."""
-    package = Path(str(resources.files("sofnn_torch")))
-    installed = package / "assets" / "khepera_maze.xml"
-    return installed if installed.is_file() else package.parent / "assets" / installed.name
-
-
-def load_model(path: str | Path | None = None, drawn: bool = True) -> mujoco.MjModel:
-    """Compile an MJCF, by default the standard maze.
+def load_model(layout: str | Path = STANDARD, drawn: bool = True) -> mujoco.MjModel:
+    """Compile a layout, by default the standard maze.
 
     Without the `drawn` geoms that collide with nothing, physics is the same and faster.
 
     Raises:
-        ValueError: if there is no such file, or MuJoCo cannot read it.
+        ValueError: if there is no such layout, or MuJoCo cannot read it.
     """
-    if not isinstance(path, str | Path | None):
-        raise ValueError(f"model_path must be the path of an MJCF file, not {show(path)}")
-    path = Path(path) if path is not None else default_model_path()
-    if not path.is_file():
-        raise ValueError(f"no MJCF file at {path}")
+    text = mjcf(content(layout))
     try:
-        spec = mujoco.MjSpec.from_file(str(path))
+        spec = mujoco.MjSpec.from_string(text)
         spec.compiler.discardvisual = not drawn
         return spec.compile()
     except Exception as error:  # MuJoCo's own are of several kinds and lines
-        raise ValueError(f"{path} is no MJCF model: {' '.join(str(error).split())}") from error
-
-
-def heading_of(w: float, x: float, y: float, z: float) -> float:
-    """Return the yaw [rad, in [-pi, pi)] of a unit quaternion."""
-    return wrap_angle(math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))
-
-
-@dataclass(frozen=True)
-class MazePlan:
-    """The maze as seen from above, in metres; read from the MJCF, the only source of geometry."""
-
-    size: tuple[float, float]
-    walls: list[tuple[float, float, float, float]]  # x0, y0, x1, y1, outer walls included
-    start: Pose
-    goal: tuple[float, float]
-    goal_radius: float
-    subgoals: list[tuple[float, float]]
-    subgoal_radius: float
-    start_radius: float
-    robot_radius: float
-
-    @classmethod
-    def from_model(cls, model: mujoco.MjModel) -> "MazePlan":
-        """Read walls, zones, robot size and start pose from named geoms, sites and the keyframe."""
-        walls = []
-        for geom in (model.geom(i) for i in range(model.ngeom)):
-            if geom.name.startswith("wall"):
-                (x, y, _), (a, b, _) = geom.pos.tolist(), geom.size.tolist()
-                walls.append((x - a, y - b, x + a, y + b))
-        if not walls:
-            raise KeyError("a geom whose name begins with wall")
-        sites = [model.site(i) for i in range(model.nsite)]
-        zones = {site.name: (tuple(site.pos[:2].tolist()), site.size.item(0)) for site in sites}
-        subgoals = [zones[name] for name in sorted(zones) if name.startswith("subgoal")]
-        x, y, _, *quaternion = model.key("start").qpos[:7].tolist()
-        return cls(
-            # The outer walls begin where the arena ends.
-            size=(max(wall[0] for wall in walls), max(wall[1] for wall in walls)),
-            walls=walls,
-            start=(x, y, heading_of(*quaternion)),
-            goal=zones["goal"][0],
-            goal_radius=zones["goal"][1],
-            subgoals=[position for position, _ in subgoals],
-            subgoal_radius=subgoals[0][1] if subgoals else 0.0,
-            start_radius=zones["start"][1],
-            robot_radius=model.geom("rim").size.item(0),
-        )
-
-    def clearance(self, x: float, y: float) -> float:
-        """Return the free distance [m] between a robot centred at (x, y) and the nearest wall."""
-        return (
-            min(
-                math.hypot(max(x0 - x, 0.0, x - x1), max(y0 - y, 0.0, y - y1))
-                for x0, y0, x1, y1 in self.walls
-            )
-            - self.robot_radius
-        )
+        raise ValueError(f"it is no MJCF model: {' '.join(str(error).split())}") from error
 
 
 class Physics:
     """The simulated robot: drives, and answers questions about its state."""
 
-    def __init__(self, model: str | Path | mujoco.MjModel | None = None) -> None:
-        """Take a model or an MJCF file with the element names of the standard maze (default).
+    def __init__(self, layout: str | Path | mujoco.MjModel = STANDARD) -> None:
+        """Take a layout or a model with the element names of the standard maze (default).
 
         Raises:
-            ValueError: if the file is missing or the timestep does not divide 0.5 s.
+            ValueError: one line if it is no maze, or its timestep does not divide 0.5 s.
         """
-        self.model = model if isinstance(model, mujoco.MjModel) else load_model(model, drawn=False)
+        model = layout if isinstance(layout, mujoco.MjModel) else None
+        self.model = load_model(layout, drawn=False) if model is None else model
         timestep = self.model.opt.timestep
         self.substeps = round(STEP_SECONDS / timestep)
         if abs(self.substeps * timestep - STEP_SECONDS) > 1e-9:
@@ -232,3 +166,32 @@ class Physics:
         if len(state) != size:
             raise ValueError(f"the saved physics state has {len(state)} numbers, this model {size}")
         mujoco.mj_setState(self.model, self.data, np.asarray(state, dtype=np.float64), STATE)
+
+
+@functools.lru_cache(maxsize=64)
+def plan_of(layout: str) -> MazePlan:
+    """The plan of a layout as `layouts.content` returns it.
+
+    Raises:
+        ValueError: one line if it is no maze for this robot.
+    """
+    return Physics(layout).plan
+
+
+def checked(name: str, layout: str | Path) -> str:
+    """Return a layout as it is kept (`layouts.content`) if it is a maze for this robot.
+
+    Args:
+        name: of the setting, for the message.
+        layout: a name, a file or a text.
+
+    Raises:
+        ValueError: one line on what is wrong.
+    """
+    try:
+        text = content(layout)
+        plan_of(text)
+        return text
+    except ValueError as error:
+        which = "" if "\n" in str(layout) else f" {str(layout)[:120]}"
+        raise ValueError(f"{name}{which}: {error}") from None

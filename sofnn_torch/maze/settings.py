@@ -1,10 +1,13 @@
 """Settings of robot and maze; those of the environment by itself are the same."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Literal
 
-from sofnn_torch.bounds import Positive, Settings, Within
+from sofnn_torch.bounds import Positive, Settings, Within, flag
+from sofnn_torch.maze.layouts import STANDARD
+from sofnn_torch.maze.plan import MazePlan
+from sofnn_torch.maze.robot import checked, plan_of
 from sofnn_torch.network.axes import Axis
 
 Actions = Literal["three", "steer", "wheels"]
@@ -15,17 +18,17 @@ POSE = (
     Axis("y", "m", 0.0, 1.0),
     Axis("heading", "rad", -math.pi, math.pi, period=2 * math.pi),
 )
-ACTION_NAMES = {
-    "three": ("right turn", "straight", "left turn"),
-    "steer": ("steer",),
-    "wheels": ("left wheel", "right wheel"),
-}
+GOAL = Axis("goal x", "m", 0.0, 1.0), Axis("goal y", "m", 0.0, 1.0)
 
 
 @dataclass(frozen=True)
 class MazeConfig(Settings, table="maze"):
     """Section 5: robot and maze."""
 
+    layout: str = STANDARD
+    """Maze: a file with a map or an MJCF, of which the content is kept with the run, or one that is
+    built in: `s`, `open`, `rooms`, `spiral`, `large`, `starts`, `anywhere`, `goals`, `random:SEED`
+    (docs/mazes.md)."""
     actions: Actions = "three"
     """`three`: right turn, straight, left turn; `steer`: one number that blends them; `wheels`: two
     wheel speeds (SGA only)."""
@@ -52,3 +55,21 @@ class MazeConfig(Settings, table="maze"):
     """Miscalibration: the wheel radius that the robot believes in over the true one."""
     wheel_base_scale: Positive = 1.0
     """Miscalibration: the wheel base that the robot believes in over the true one."""
+
+    def __post_init__(self) -> None:
+        """Check the fields and read the layout; ValueError names the flag and what is wrong."""
+        super().__post_init__()
+        text = checked(flag(self.table, "layout"), self.layout)
+        object.__setattr__(self, "layout", text)  # the dataclass is frozen
+
+    @property
+    def axes(self) -> tuple[Axis, ...]:
+        """What the robot is told: its pose, and where the goal is if that varies."""
+        return axes(plan_of(self.layout))
+
+
+def axes(plan: MazePlan) -> tuple[Axis, ...]:
+    """The axes of the pose in a maze, and of its goal where the robot is told."""
+    ends = dict(zip("xy", plan.size, strict=True))
+    names = POSE + GOAL * plan.told
+    return tuple(replace(a, high=ends.get(a.name[-1], a.high)) for a in names)

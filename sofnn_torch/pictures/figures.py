@@ -32,14 +32,14 @@ from matplotlib.ticker import (
 from numpy.typing import NDArray
 
 from sofnn_torch.learners.learner import Learner
-from sofnn_torch.maze.odometry import motion
+from sofnn_torch.maze.spaces import motion
 from sofnn_torch.numerals import decimal
 from sofnn_torch.runs.table import read as read_trials
 
 if TYPE_CHECKING:
     from matplotlib.typing import RcKeyType
 
-    from sofnn_torch.maze.robot import MazePlan
+    from sofnn_torch.maze.plan import MazePlan
     from sofnn_torch.runs.trial import Trajectory
 
 BLUE, ORANGE, GREEN, VERMILION = "#0072B2", "#E69F00", "#009E73", "#D55E00"
@@ -99,16 +99,18 @@ def maze_plan(plan: "MazePlan", ax: Axes, labels: bool = True) -> None:
         ax.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, facecolor="0.3", linewidth=0, zorder=2))
     for number, centre in enumerate(plan.subgoals, 1):
         _spot(ax, centre, plan.subgoal_radius, "0.35", ":", f"sub-goal {number}" if labels else "")
-    _spot(ax, plan.goal, plan.goal_radius, "#006B4E", "-", "goal" if labels else "")
-    x, y, heading = plan.start
-    _spot(ax, (x, y), plan.start_radius, "0.6", "-", "start" if labels else "")
-    ax.add_patch(Circle((x, y), plan.robot_radius, fill=False, edgecolor=BLACK, zorder=3))
-    tip = plan.robot_radius * np.array([math.cos(heading), math.sin(heading)])
-    ax.plot([x, x + tip[0]], [y, y + tip[1]], color=BLACK, linewidth=1.2, zorder=4)
+    for goal in plan.goals:
+        _spot(ax, goal, plan.goal_radius, "#006B4E", "-", "goal" if labels else "")
+    for x, y, heading in [] if plan.anywhere else plan.starts:
+        _spot(ax, (x, y), plan.start_radius, "0.6", "-", "start" if labels else "")
+        ax.add_patch(Circle((x, y), plan.robot_radius, fill=False, edgecolor=BLACK, zorder=3))
+        tip = plan.robot_radius * np.array([math.cos(heading), math.sin(heading)])
+        ax.plot([x, x + tip[0]], [y, y + tip[1]], color=BLACK, linewidth=1.2, zorder=4)
     x0, y0, x1, y1 = bounds(plan)
     ax.set(xlim=(x0, x1), ylim=(y0, y1), aspect="equal", xlabel="x [m]", ylabel="y [m]")
-    ax.xaxis.set_major_locator(MultipleLocator(0.2))
-    ax.yaxis.set_major_locator(MultipleLocator(0.2))
+    tick = 0.2 * math.ceil(max(plan.size) / 1.2)
+    ax.xaxis.set_major_locator(MultipleLocator(tick))
+    ax.yaxis.set_major_locator(MultipleLocator(tick))
     ax.spines[["left", "bottom"]].set_visible(False)
 
 
@@ -190,7 +192,7 @@ def rule_map(
         The legend of the colours.
     """
     maze_plan(plan, ax, labels=False)
-    centres = agent.net.centres[:, :3].double().numpy()
+    centres = agent.net.centres[:, : len(agent.task.axes)].double().numpy()
     _, turn = motion(agent.plan(centres).actions)
     colours = TURNS(Normalize(-1, 1)(turn))
     sizes = np.full(len(centres), 6.0)
@@ -284,6 +286,11 @@ def rules(
     return figure
 
 
+def _states(plan: "MazePlan", poses: NDArray[Any]) -> NDArray[Any]:
+    """What a learner is told at poses (P, 3): where goals vary, that the first is meant."""
+    return np.hstack([poses, np.tile(plan.goal, (len(poses), 1))]) if plan.told else poses
+
+
 def _grid(plan: "MazePlan", columns: int, headings: int) -> tuple[NDArray[Any], NDArray[Any]]:
     """Poses on a regular grid (P * headings, 3) and which positions a robot can stand on (P,)."""
     x0, y0, x1, y1 = bounds(plan)
@@ -313,7 +320,7 @@ def action_field(
     poses, free = _grid(plan, columns, headings)
     mask = np.repeat(free, headings)
     poses = poses[mask]
-    forward, turn = motion(agent.plan(poses).actions)
+    forward, turn = motion(agent.plan(_states(plan, poses)).actions)
     ahead = np.column_stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])])
     aside = np.column_stack([-ahead[:, 1], ahead[:, 0]])
     step = np.ptp(bounds(plan)[::2]) / columns
@@ -350,7 +357,7 @@ def value_field(
         ValueError: the learner keeps no value (SGA with a constant baseline).
     """
     poses, _ = _grid(plan, columns, headings)
-    value = agent.plan(poses).value
+    value = agent.plan(_states(plan, poses)).value
     if value is None:
         raise ValueError("this learner keeps no value: it was trained with --sga.baseline constant")
     picture = value.reshape(-1, columns, headings).max(2)

@@ -22,7 +22,7 @@ from tensorboard.compat.proto.summary_pb2 import Summary
 from torch.utils.tensorboard.summary import hparams
 
 from sofnn_torch.learners.learner import Learner
-from sofnn_torch.maze.robot import MazePlan
+from sofnn_torch.maze.plan import MazePlan
 from sofnn_torch.pictures import figures
 from sofnn_torch.pictures.events import EventFile
 from sofnn_torch.pictures.film import film, gif

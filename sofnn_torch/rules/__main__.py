@@ -213,7 +213,7 @@ def state_of(options: Options, config: Config) -> NDArray[np.float32]:
         raise ValueError(f"--at needs {len(axes)} numbers ({names}), got {len(values)}")
     if config.env == MAZE:
         width, height = make_plan(config).size
-        x, y, degrees = values
+        x, y, degrees = values[:3]
         if not (0 <= x <= width and 0 <= y <= height):
             say(f"warning: --at {x:g} {y:g} is outside the maze of {width:g} x {height:g} m")
         values[2] = math.remainder(math.radians(degrees), 2 * math.pi)

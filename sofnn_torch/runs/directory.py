@@ -327,11 +327,23 @@ def same_settings(path: Path, state: dict[str, Any], config: Config) -> None:
     Raises:
         CheckpointError: naming the first setting that differs.
     """
-    theirs, ours = flatten(state["config"]), flatten(dataclasses.asdict(config))
+    try:  # settings that an older version did not have are those that it meant
+        read = dataclasses.asdict(from_dict(state["config"]))
+    except ValueError as error:
+        raise CheckpointError(f"{path}: {error}") from None
+    theirs, ours = flatten(read), flatten(dataclasses.asdict(config))
     for name in sorted(theirs.keys() | ours.keys(), key=str):
         a, b = theirs.get(name), ours.get(name)
         if a != b and name != "trials":
-            raise CheckpointError(f"{path}: of a run with other settings ({name} {a}, here {b})")
+            raise CheckpointError(
+                f"{path}: of a run with other settings ({name} {brief(a)}, here {brief(b)})"
+            )
+
+
+def brief(value: Any) -> str:
+    """A setting in one short line; of a text its beginning and its length."""
+    text = " ".join(str(value).split())
+    return text if len(text) <= 60 else f"{text[:40]}... ({len(str(value))} characters)"
 
 
 def flatten(settings: dict[str, Any], prefix: str = "") -> dict[str, Any]:

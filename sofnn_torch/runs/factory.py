@@ -5,7 +5,8 @@ from typing import Any
 
 from sofnn_torch.learners.learner import Learner
 from sofnn_torch.maze.env import KheperaMazeEnv
-from sofnn_torch.maze.robot import MazePlan
+from sofnn_torch.maze.plan import MazePlan
+from sofnn_torch.maze.robot import plan_of
 from sofnn_torch.network.sofnn import SOFNN, grid
 from sofnn_torch.runs.settings import MAZE, Config
 from sofnn_torch.tasks.env import TaskEnv, make
@@ -31,9 +32,7 @@ def make_task(config: Config, render_mode: str | None = None) -> TaskEnv:
 
 def make_plan(config: Config) -> MazePlan:
     """The maze of settings for it as seen from above."""
-    env = make_maze(config)
-    env.close()
-    return env.plan
+    return plan_of(config.maze.layout)
 
 
 def make_agent(config: Config) -> Learner:

@@ -9,14 +9,19 @@ import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
-from sofnn_torch.runs.settings import Config
+from sofnn_torch.maze.layouts import STANDARD
+from sofnn_torch.runs.settings import MAZE, Config
 
 UNNAMED = ".new-run"  # ending of a directory that is not yet whole
 
 
 def default_name(config: Config) -> str:
-    """Name of a run directory, e.g. sga-sofnn-estimated-s0, or sga-sofnn-MountainCar-v0-s0."""
-    task = config.pose if config.env == "maze" else re.sub(r"[^\w.-]+", "-", config.env)
+    """Name of a run directory, e.g. sga-sofnn-estimated-s0, or sga-sofnn-rooms-estimated-s0."""
+    task = re.sub(r"[^\w.-]+", "-", config.env)
+    if config.env == MAZE:
+        layout = config.maze.layout
+        name = "own" if "\n" in layout else layout.replace(":", "-")
+        task = config.pose if layout == STANDARD else f"{name}-{config.pose}"
     return f"{config.learner.name}-{config.network}-{task}-s{config.seed}"
 
 

@@ -21,8 +21,8 @@ from sofnn_torch.learners import learner_class
 from sofnn_torch.learners.learner import Learner, Task
 from sofnn_torch.learners.qlearning import QConfig
 from sofnn_torch.learners.sga import SGAConfig
-from sofnn_torch.maze.odometry import wheel_speeds
-from sofnn_torch.maze.settings import ACTION_NAMES, POSE, MazeConfig
+from sofnn_torch.maze.settings import MazeConfig
+from sofnn_torch.maze.spaces import ACTION_NAMES, wheel_speeds
 from sofnn_torch.network.axes import Axis, named
 from sofnn_torch.network.settings import NetworkConfig
 from sofnn_torch.runs import presets
@@ -106,7 +106,7 @@ class Config(Settings):
         """What is learned."""
         if self.env == MAZE:
             kind = self.maze.actions
-            return Task(POSE, ACTION_NAMES[kind], kind == "three", wheel_speeds)
+            return Task(self.maze.axes, ACTION_NAMES[kind], kind == "three", wheel_speeds)
         found, axes = look(self.env), named([Axis(*given) for given in self.axes])
         scale = self.reward_scale
         return Task(axes, found.actions, found.discrete, reward_scale=scale, patience=math.inf)
@@ -145,7 +145,7 @@ class Config(Settings):
         """Width of new membership functions on each input of the network, in its unit."""
         net, axes = self.net, self.task.axes
         if self.env == MAZE:
-            widths = [net.width_position, net.width_position, net.width_heading]
+            widths = [net.width_heading if a.period else net.width_position for a in axes]
         else:
             shares = _each(net.width, len(axes), "--net.width")
             widths = [v * (a.high - a.low) for v, a in zip(shares, axes, strict=True)]
@@ -207,8 +207,9 @@ class Config(Settings):
                 f"--maze.goal-reward {reward:g}, or None"
             )
         _each(self.net.width, len(self.task.axes), "--net.width")
-        shape = self.grid  # also checks that the learner can do the task
-        if self.network == "fixed" and math.prod(shape) > self.net.max_rules:
+        self._inputs  # noqa: B018 - checks that the learner can do the task
+        shape = self.grid if self.network == "fixed" else ()
+        if math.prod(shape) > self.net.max_rules:
             raise ValueError(
                 f"--net.grid {shape} has more rules than --net.max-rules {self.net.max_rules}"
             )

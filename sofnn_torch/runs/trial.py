@@ -57,14 +57,19 @@ class Trajectory:
     Attributes:
         true: where it was. Shape: (T, n).
         estimated: where the learner believed to be. Shape: (T, n).
+        goal: where the goal of the trial was, if the learner was told. Shape: (0,) or (2,).
     """
 
     true: NDArray[Any]
     estimated: NDArray[Any]
+    goal: NDArray[Any] = field(default_factory=lambda: np.zeros(0))
 
     def decided_at(self, pose: str) -> NDArray[Any]:
         """The states (T - 1, n) of the decisions, for a robot that knows its pose by this mode."""
-        return (self.true if pose == "true" else self.estimated)[:-1]
+        states = (self.true if pose == "true" else self.estimated)[:-1]
+        return (
+            np.hstack([states, np.tile(self.goal, (len(states), 1))]) if len(self.goal) else states
+        )
 
 
 class Recorder:
@@ -91,12 +96,11 @@ class Recorder:
     ) -> tuple[TrialRecord, Trajectory]:
         """The record of the trial and the states from the start on."""
         last, seen = self.infos[-1], list(zip(self.infos, self.observations, strict=True))
-        path = Trajectory(
-            *(
-                np.array([info.get(name, x) for info, x in seen])
-                for name in ("true_pose", "estimated_pose")
-            )
+        true, estimated = (
+            np.array([info.get(name, x) for info, x in seen])
+            for name in ("true_pose", "estimated_pose")
         )
+        path = Trajectory(true, estimated, last.get("goal", np.zeros(0)))
         success = last.get("success")
         record = TrialRecord(
             trial=0,

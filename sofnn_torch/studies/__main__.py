@@ -20,8 +20,9 @@ if __name__ == "__main__":  # Ctrl-C while libraries load: there is nothing to s
 
 from sofnn_torch import terminal
 from sofnn_torch.bounds import Count, Settings
-from sofnn_torch.maze.optimum import optimal_steps
-from sofnn_torch.maze.robot import Physics
+from sofnn_torch.maze.layouts import STANDARD
+from sofnn_torch.maze.optimum import mean_optimum
+from sofnn_torch.maze.robot import checked, plan_of
 from sofnn_torch.runs import parallel
 from sofnn_torch.studies import collecting, report, running
 
@@ -44,6 +45,8 @@ class Options(Settings):
     """Trials of every run; by default those of the presets."""
     max_steps: Count | None = None
     """Steps after which a trial ends; by default those of the presets."""
+    layout: str | None = None
+    """Maze of every run, as `--maze.layout` of `train.py`; by default that of the presets."""
     out: Path | None = None
     """Where data, tables and figures go; by default docs/results."""
     runs: Path | None = None
@@ -80,9 +83,13 @@ def complete(options: Options) -> Complete:
     return dataclasses.replace(QUICK if options.quick else Complete(), **given)
 
 
-def variations(options: Options) -> dict[str, int]:
+def variations(options: Options) -> dict[str, int | str]:
     """The settings that the options change in every arm."""
-    asked = {"trials": options.trials, "maze.max_steps": options.max_steps}
+    asked = {
+        "trials": options.trials,
+        "maze.max_steps": options.max_steps,
+        "maze.layout": options.layout and checked("--layout", options.layout),
+    }
     return {name: value for name, value in asked.items() if value is not None}
 
 
@@ -92,7 +99,7 @@ def command(name: str, options: Options) -> str:
     words = [f"python -m sofnn_torch.studies --study {name}", *["--quick"] * options.quick]
     words += [
         f"--{flag.replace('_', '-')} {getattr(options, flag)}"
-        for flag in ("arms", "seeds", "trials", "max_steps")
+        for flag in ("arms", "seeds", "trials", "max_steps", "layout")
         if getattr(options, flag) != getattr(usual, flag)
     ]
     return " ".join(words)
@@ -113,7 +120,7 @@ def run(options: Options) -> int:
     if not jobs:
         raise ValueError(f"--arms {asked.arms}: no arm of {', '.join(asked.study)} has that")
     failed = running.execute(jobs, asked.workers)
-    optimum = optimal_steps(Physics().plan).steps
+    optimum = mean_optimum(plan_of(str(changes.get("maze.layout", STANDARD))))
     for name in asked.study:
         notes = {"command": command(name, asked), "quick": asked.quick, "optimum": optimum}
         collecting.collect(name, asked.runs, asked.out, changes, notes)

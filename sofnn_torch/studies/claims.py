@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sofnn_torch.evaluate import Estimate, proportion
-from sofnn_torch.maze.robot import Physics
+from sofnn_torch.maze.robot import plan_of
 from sofnn_torch.studies.drawing import AGENTS, NETWORKS, last_paths
 from sofnn_torch.studies.results import Data, cell, censored, learned_after, mean, median, ratio
 
@@ -53,7 +53,7 @@ def arriving(data: Data, arm: str) -> tuple[int, int]:
 
 def resets(data: Data, arm: str) -> tuple[int, int, float]:
     """Paths with a reset at both sub-goals, all paths, median largest error [m]."""
-    plan = Physics().plan
+    plan = plan_of(data.layout)
     twice, largest = 0, []
     paths = last_paths(data, arm)
     for path in paths.values():

@@ -10,8 +10,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import StrMethodFormatter
 
+from sofnn_torch.maze.plan import MazePlan
 from sofnn_torch.maze.rendering import OffscreenRenderer, RenderingError
-from sofnn_torch.maze.robot import MazePlan, Physics, load_model
+from sofnn_torch.maze.robot import Physics, load_model, plan_of
 from sofnn_torch.pictures import figures
 from sofnn_torch.runs.trial import Trajectory
 from sofnn_torch.studies.results import Data
@@ -61,8 +62,8 @@ def _figures(data: Data) -> Iterator[tuple[str, Figure | None, str]]:
 
 
 def _of_the_paper(data: Data) -> Iterator[tuple[str, Figure | None, str]]:
-    plan = Physics().plan
-    yield "fig6", maze(plan), "Fig. 6: the maze, as rendered and as a plan."
+    plan = plan_of(data.layout)
+    yield "fig6", maze(data.layout), "Fig. 6: the maze, as rendered and as a plan."
     optimum = ("kinematic optimum", data.info["optimum"])
     for number, agent in ((7, "sga"), (8, "q")):
         names = {text: f"{agent}-{network}-estimated" for network, text in NETWORKS.items()}
@@ -134,12 +135,11 @@ def _curves(data: Data, names: dict[str, str], quantity: str = "steps") -> dict[
 
 
 @figures.styled
-def maze(plan: MazePlan, size: int = 900) -> Figure | None:
+def maze(layout: str, size: int = 900) -> Figure | None:
     """The maze as it is rendered, beside its plan; None where nothing can be rendered."""
     try:
-        physics = Physics()
-        physics.place(plan.start)
-        renderer = OffscreenRenderer(load_model(), size, size)
+        physics = Physics(layout)
+        renderer = OffscreenRenderer(load_model(layout), size, size)
         picture = renderer.draw(physics.data.qpos)
         renderer.close()
     except RenderingError as error:
@@ -148,7 +148,7 @@ def maze(plan: MazePlan, size: int = 900) -> Figure | None:
     figure, (left, right) = figures.canvas(2)
     left.imshow(picture, extent=(0, 1, 0, 1))
     left.set_axis_off()
-    figures.maze_plan(plan, right)
+    figures.maze_plan(physics.plan, right)
     return figure
 
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from sofnn_torch.evaluate import CONFIDENCE, Estimate
+from sofnn_torch.maze.layouts import STANDARD
 from sofnn_torch.numerals import decimal
 
 
@@ -25,6 +26,12 @@ class Data:
     info: dict[str, Any]
     rows: list[dict[str, Any]]
     tables: dict[str, list[dict[str, Any]]]
+
+    @property
+    def layout(self) -> str:
+        """The maze of the runs."""
+        arms = self.info["arms"].values()
+        return next((arm["config"]["maze"].get("layout", STANDARD) for arm in arms), STANDARD)
 
     def arms(self) -> list[str]:
         """The arms that have finished runs, those of equal settings but once."""
