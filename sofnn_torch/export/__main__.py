@@ -1,6 +1,7 @@
 """Write the learned policy of a run for other programs and machines.
 
     python -m sofnn_torch.export RUN --to policy.json       # and sofnn_runtime.py: NumPy alone
+    python -m sofnn_torch.export RUN --to policy.h          # C99; --precision int16: no library
 
 The run directory is not changed. docs/export.md says what each format holds and what it cannot.
 """
@@ -9,7 +10,7 @@ import signal
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 if __name__ == "__main__":  # Ctrl-C while libraries load
     signal.signal(signal.SIGINT, signal.SIG_DFL)
@@ -18,12 +19,18 @@ import tyro
 
 from sofnn_torch.bounds import Settings
 from sofnn_torch.evaluate import load
-from sofnn_torch.export import policy
+from sofnn_torch.export import c, policy
 from sofnn_torch.runs import checkpoint
 from sofnn_torch.terminal import command, plural
 
-READERS: dict[str, Callable[[Path], dict[str, Any]]] = {".json": policy.from_json}
-WRITERS: dict[str, Callable[[dict[str, Any]], bytes]] = {".json": policy.to_json}
+READERS: dict[str, Callable[[Path], dict[str, Any]]] = {
+    ".json": policy.from_json,
+    ".h": c.from_header,
+}
+WRITERS: dict[str, Callable[[dict[str, Any], Path, str], bytes]] = {
+    ".json": lambda data, *_: policy.to_json(data),
+    ".h": c.to_header,
+}
 
 
 @dataclass(frozen=True)
@@ -33,7 +40,11 @@ class Options(Settings):
     run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
     """Directory of the run, one of its checkpoint files, or a file that this command wrote."""
     to: tuple[Path, ...]
-    """Files to write; their endings say in which formats: .json."""
+    """Files to write; their endings say in which formats: .json (and a file that plays it with
+    NumPy alone), .h (C99)."""
+    precision: Literal["float", "int16"] = "float"
+    """Numbers of the C header: `float`, with math.h, or `int16`, whole numbers without any
+    library."""
     best: bool = False
     """Take the checkpoint with the best last 10 trials instead of the latest."""
 
@@ -51,6 +62,8 @@ def check(options: Options) -> None:
             raise ValueError(f"--to must end in {' or '.join(WRITERS)}, got {path}")
         if path.is_dir() or not path.parent.is_dir():
             raise ValueError(f"--to {path}: not a file in an existing directory")
+    if options.precision != "float" and not any(p.suffix.lower() == ".h" for p in options.to):
+        raise ValueError("--precision is for a C header: give --to a file that ends in .h")
     if options.best and options.run.suffix.lower() in READERS:
         raise ValueError(f"--best chooses a checkpoint of a run, and {options.run} is a policy")
 
@@ -77,11 +90,15 @@ def run(options: Options) -> None:
     """
     check(options)
     data = source(options)
-    written = [(path, WRITERS[path.suffix.lower()](data)) for path in options.to]
+    if "fixed" in data and any(path.suffix.lower() != ".h" for path in options.to):
+        raise ValueError(f"{options.run} holds rounded numbers: export the run itself")
+    written = [
+        (path, WRITERS[path.suffix.lower()](data, path, options.precision)) for path in options.to
+    ]
     folders = dict.fromkeys(path.parent for path in options.to if path.suffix.lower() == ".json")
     written += [(folder / policy.RUNTIME, policy.runtime_source()) for folder in folders]
-    rules = plural(len(data["rules"]), "rule")
-    print(f"{options.run}: {data['learner']} on {data['task']}, {rules}")
+    count = len(data["fixed"].rules if "fixed" in data else data["rules"])
+    print(f"{options.run}: {data['learner']} on {data['task']}, {plural(count, 'rule')}")
     for path, content in written:
         checkpoint.write_atomically(path, content)
         print(f"written: {path} ({len(content):,} bytes)")
