@@ -2,6 +2,7 @@
 
     python -m sofnn_torch.export RUN --to policy.json       # and sofnn_runtime.py: NumPy alone
     python -m sofnn_torch.export RUN --to policy.h          # C99; --precision int16: no library
+    python -m sofnn_torch.export RUN --to policy.onnx
 
 The run directory is not changed. docs/export.md says what each format holds and what it cannot.
 """
@@ -19,17 +20,19 @@ import tyro
 
 from sofnn_torch.bounds import Settings
 from sofnn_torch.evaluate import load
-from sofnn_torch.export import c, policy
+from sofnn_torch.export import c, graph, policy
 from sofnn_torch.runs import checkpoint
 from sofnn_torch.terminal import command, plural
 
 READERS: dict[str, Callable[[Path], dict[str, Any]]] = {
     ".json": policy.from_json,
     ".h": c.from_header,
+    ".onnx": graph.from_onnx,
 }
 WRITERS: dict[str, Callable[[dict[str, Any], Path, str], bytes]] = {
     ".json": lambda data, *_: policy.to_json(data),
     ".h": c.to_header,
+    ".onnx": graph.to_onnx,
 }
 
 
@@ -41,7 +44,7 @@ class Options(Settings):
     """Directory of the run, one of its checkpoint files, or a file that this command wrote."""
     to: tuple[Path, ...]
     """Files to write; their endings say in which formats: .json (and a file that plays it with
-    NumPy alone), .h (C99)."""
+    NumPy alone), .h (C99), .onnx."""
     precision: Literal["float", "int16"] = "float"
     """Numbers of the C header: `float`, with math.h, or `int16`, whole numbers without any
     library."""
