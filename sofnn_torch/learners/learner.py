@@ -262,6 +262,14 @@ class Learner(ABC):
         """Inputs of the network at states (.., n): these, or with every action (.., J, n + 1)."""
         return x
 
+    def decoding(self) -> dict[str, Any]:
+        """How outputs of the network become an action, as plain data (docs/export.md).
+
+        Raises:
+            ValueError: the learner does not say it, and its policy cannot leave Python.
+        """
+        raise ValueError(f"a policy of --agent {self.name} cannot be exported: it has no decoding")
+
     def statistics(self) -> dict[str, float]:
         """Means over the decisions since the last call (docs/metrics.md); starts afresh."""
         log, self._log = self._log, defaultdict(list)

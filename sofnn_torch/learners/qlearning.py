@@ -209,6 +209,17 @@ class QLearning(Learner):
             return x
         return torch.cat(self._beside(x, self.codes), -1)
 
+    def decoding(self) -> dict[str, Any]:
+        """The outputs are c_x, c_a and c of equation 9; the greatest value chooses."""
+        return {
+            "kind": "values",
+            "codes": self.codes.tolist(),
+            "edges": [list(edge) for edge in self.edges],
+            "representatives": self.representatives,
+            "temperature": self.settings.temperature,
+            "action_input": self.coding == "antecedent",
+        }
+
     def _policy(self, x: Tensor) -> tuple[Tensor, Tensor | None]:
         inputs = self.network_inputs(x)
         firing = self.net.normalised_firing(inputs.reshape(-1, inputs.shape[-1]))

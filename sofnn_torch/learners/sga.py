@@ -182,6 +182,10 @@ class SGA(Learner):
         """The action that each mean stands for. Shape: (K,)."""
         return np.searchsorted(self.edges, conclusions[:, 0]) if self.choices else None
 
+    def decoding(self) -> dict[str, Any]:
+        """The first m outputs are means, the next m deviations; edges part discrete actions."""
+        return {"kind": "normal", "numbers": self.m, "edges": self.edges if self.choices else None}
+
     def _policy(self, x: Tensor) -> tuple[Tensor, Tensor | None]:
         outputs = self.net(x)
         value = outputs[:, -1] if self.learned else None

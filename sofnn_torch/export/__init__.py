@@ -1,0 +1,1 @@
+"""A learned policy for other programs and machines: NumPy, C, ONNX, fuzzy tools."""
