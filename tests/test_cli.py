@@ -248,7 +248,7 @@ def test_growth_without_end_stops_at_the_limit_and_says_so(agent, here, capsys):
         ("--agent q --q.coding antecedent --net.width-action 1e-6", "every width must be at least"),
         ("--net.max-rules 0", "--net.max-rules must be positive"),
         ("--net.theta x", "--net.theta must be a number, got 'x'"),
-        ("--net.grid 4 4", "--net.grid needs 3 values"),
+        ("--network fixed --net.grid 4 4", "--net.grid needs 3 values"),
         ("--net.grid 4 4 x", "--net.grid cannot be ['4', '4', 'x']"),
         ("--agent q --q.trace-limit x", "--q.trace-limit must be FLOAT or None, got ['x']"),
         ("--network fixed --net.grid 999 999 999", "--net.max-rules"),

@@ -266,7 +266,7 @@ def test_new_blocks_stand_in_the_order_of_the_network():
     whole, kinds = momentum(net.parameters()), Adam(net.parameter_groups(**KINDS))
     for optimizer in (whole, kinds):
         net.follow(optimizer)
-    for place in PLACES[3:12]:
+    for place in PLACES[3:17]:
         net.add_rule(place)
     (group,) = whole.param_groups
     assert [*map(id, group["params"])] == [*map(id, net.parameters())]

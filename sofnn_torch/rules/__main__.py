@@ -2,6 +2,7 @@
 
     python -m sofnn_torch.rules RUN                        # the rules that matter most, a table
     python -m sofnn_torch.rules RUN --at 0.15 0.15 90      # who decides at a pose: m, m, degrees
+    python -m sofnn_torch.rules RUN --within 0.1 0.2 0.1 0.2 60 120   # what it can do in a region
     python -m sofnn_torch.rules RUN --json rules.json --csv rules.csv --picture rules.png
     python -m sofnn_torch.rules RUN --load rules.json      # edited rules become a new run
 
@@ -31,8 +32,10 @@ from rich.table import Table
 from sofnn_torch.bounds import Settings, Within
 from sofnn_torch.evaluate import learned, load
 from sofnn_torch.learners.learner import Learner
+from sofnn_torch.network.axes import Axis
 from sofnn_torch.pictures import figures
 from sofnn_torch.rules import files, words
+from sofnn_torch.rules.regions import Answer, actions_within
 from sofnn_torch.rules.words import Decision, Reading, number
 from sofnn_torch.runs import checkpoint, seeding
 from sofnn_torch.runs.directory import Run
@@ -61,6 +64,9 @@ class Options(Settings):
     at: tuple[float, ...] | None = None
     """Show which rules decide at a state instead: in the maze x and y in metres and the heading in
     degrees, in another task its inputs in their order and units."""
+    within: tuple[float, ...] | None = None
+    """Show instead which actions the policy can take anywhere in a region, proved or with an
+    example: the lower and the upper end of each input, in the units of --at."""
     json: Path | None = None
     """Write all rules to this .json file."""
     csv: Path | None = None
@@ -83,6 +89,8 @@ def check(options: Options) -> None:
     """
     if options.at and not all(abs(value) < 1e6 for value in options.at):
         raise ValueError(f"--at must be a state in the units of its inputs, got {options.at}")
+    if options.within and not all(abs(value) < 1e6 for value in options.within):
+        raise ValueError(f"--within needs ends in the units of its inputs, got {options.within}")
     if options.name is not None and not options.load:
         raise ValueError("--name goes with --load")
     RunOptions(name=options.name)
@@ -93,8 +101,8 @@ def check(options: Options) -> None:
             raise ValueError(f"--{name} must end in {' or '.join(endings)}, got {path}")
         if path and (path.is_dir() or not path.parent.is_dir()):
             raise ValueError(f"--{name} {path}: not a file in an existing directory")
-    given = [f"--{name}" for name in ("load", "at", *outputs) if getattr(options, name)]
-    if len(given) > 1 and (options.load or options.at):
+    given = [f"--{name}" for name in ("load", "at", "within", *outputs) if getattr(options, name)]
+    if len(given) > 1 and (options.load or options.at or options.within):
         raise ValueError(f"{given[0]} and {given[1]} do not go together: use two commands")
 
 
@@ -225,6 +233,37 @@ def state_of(options: Options, config: Config) -> NDArray[np.float32]:
     return np.array(values, np.float32)
 
 
+def region_of(options: Options, config: Config) -> tuple[list[float], list[float]]:
+    """The lower and upper ends of the region that was asked for.
+
+    Raises:
+        ValueError: it has other numbers of ends, or a lower end above the upper one.
+    """
+    axes, ends = config.task.axes, list(options.within or ())
+    if len(ends) != 2 * len(axes):
+        names = ", ".join(axis.name for axis in axes)
+        raise ValueError(f"--within needs two ends for each of {names}, got {len(ends)} numbers")
+    low, high = ends[::2], ends[1::2]
+    for axis, a, b in zip(axes, low, high, strict=True):
+        if a > b:
+            hint = f" (through the seam: {a:g} {b + 360:g})" if config.env == MAZE else ""
+            raise ValueError(f"--within {axis.name} {a:g} {b:g}: the lower end comes first{hint}")
+    if config.env == MAZE:
+        low[2], high[2] = math.radians(low[2]), math.radians(high[2])
+    return low, high
+
+
+def region_table(answers: Sequence[Answer], axes: Sequence[Axis]) -> Table:
+    """What a policy can do in a region."""
+    view = Table("action", "there", "for example", box=SIMPLE_HEAD, pad_edge=False)
+    said = {True: "taken", False: "never: proved", None: "not decided"}
+    for answer in answers:
+        found = answer.example
+        place = "" if found is None else ", ".join(map(words.at, axes, found.tolist()))
+        view.add_row(answer.action, said[answer.possible], place)
+    return view
+
+
 def edit(
     options: Options,
     file: Path,
@@ -309,6 +348,10 @@ def run(options: Options) -> None:
         show(decision_table(reading, decision, len(agent.inputs) > len(agent.task.axes)))
         print(f"action: {decision.action}")
         print(f"firing strength of the strongest rule: {decision.strongest:.2g}")
+        return
+    if options.within:
+        answers = actions_within(agent, *region_of(options, config))
+        show(region_table(answers, config.task.axes))
         return
     shares, decisions, outcome = firing_along_a_trial(config, agent, options.seed)
     print(f"one trial without learning or exploration, seed {options.seed}: {outcome}")
