@@ -102,3 +102,17 @@ def test_an_unknown_state_keeps_its_initial_value_where_the_policy_is_interpolat
     net.add_rule(torch.zeros(3), consequents=torch.tensor([0.5, 0.2, 0.1]))
     net.add_rule(torch.ones(3))
     assert net.consequents[1].tolist() == pytest.approx([0.5, 0.2, 0.65])
+
+
+@pytest.mark.parametrize(
+    ("agent", "network", "theta", "widths"),
+    [
+        ("sga", "sofnn", 0.4, (0.06, 0.45)),
+        ("q", "sofnn", 0.3, (0.045, 0.4)),
+        ("sga", "fixed", 0.4, (0.042, 0.39)),  # half of 1 m / 12 and of a turn / 8
+        ("q", "fixed", 0.3, (0.042, 0.39)),
+    ],
+)
+def test_the_sets_of_the_default_are_those_that_the_documents_print(agent, network, theta, widths):
+    net = Config(agent=agent, network=network).net
+    assert (net.theta, net.width_position, net.width_heading) == (theta, *widths)
