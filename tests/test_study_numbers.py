@@ -134,7 +134,7 @@ def through(zones, errors):
     ],
 )
 def test_resets_count_where_the_error_ends_at_both_subgoals(errors, twice, monkeypatch):
-    plan = claims.Physics().plan
+    plan = claims.plan_of("s")
     path = through(plan.subgoals, errors)
     monkeypatch.setattr(claims, "last_paths", lambda data, arm: {0: path})
     assert claims.resets(SimpleNamespace(layout="s"), "arm") == (twice, 1, pytest.approx(0.05))
