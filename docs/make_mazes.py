@@ -12,7 +12,7 @@ from sofnn_torch.terminal import command
 
 OUT = Path(__file__).parent / "images"
 SIZE = 600  # pixels of a rendered picture
-SEEDS = range(3)  # of the random mazes that are shown
+SEEDS = range(2)  # of the random mazes that are shown
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ KINDS = [
     {"actions": actions, "pose": pose, "range_sensors": ranges}
     for actions, pose, ranges in itertools.product(ACTIONS, POSES, (False, True))
 ]
+KINDS += [{"layout": name} for name in ("starts", "anywhere", "goals", "random:0")]
 KINDS += [{"dead_reckoning": "literal", "wheel_noise": "independent"}, {"dead_reckoning": "still"}]
 
 every_kind = pytest.mark.parametrize(
@@ -93,6 +94,15 @@ def test_observations_are_valid_not_aliased_and_change(kind):
             env.reset()
     np.testing.assert_array_equal(kept, copies)
     assert (np.ptp(copies, axis=0) > 0.01).all()
+
+
+@pytest.mark.parametrize("layout", ["s", "goals"])
+@pytest.mark.parametrize("actions", ACTIONS)
+def test_stable_baselines_accepts_the_environment(actions, layout):
+    checker = pytest.importorskip("stable_baselines3.common.env_checker")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        checker.check_env(gymnasium.make(ID, actions=actions, layout=layout).unwrapped)
 
 
 def piece(env):

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Annotated, Literal
 
 from sofnn_torch.bounds import Positive, Settings, Within, flag
@@ -58,6 +59,8 @@ class MazeConfig(Settings, table="maze"):
 
     def __post_init__(self) -> None:
         """Check the fields and read the layout; ValueError names the flag and what is wrong."""
+        if isinstance(self.layout, Path):
+            object.__setattr__(self, "layout", str(self.layout))
         super().__post_init__()
         text = checked(flag(self.table, "layout"), self.layout)
         object.__setattr__(self, "layout", text)  # the dataclass is frozen
