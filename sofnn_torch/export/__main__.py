@@ -2,7 +2,8 @@
 
     python -m sofnn_torch.export RUN --to policy.json       # and sofnn_runtime.py: NumPy alone
     python -m sofnn_torch.export RUN --to policy.h          # C99; --precision int16: no library
-    python -m sofnn_torch.export RUN --to policy.onnx
+    python -m sofnn_torch.export RUN --to policy.onnx policy.fis
+    python -m sofnn_torch.export other.fis --like RUN --to policy.json
 
 The run directory is not changed. docs/export.md says what each format holds and what it cannot.
 """
@@ -20,7 +21,7 @@ import tyro
 
 from sofnn_torch.bounds import Settings
 from sofnn_torch.evaluate import load
-from sofnn_torch.export import c, graph, policy
+from sofnn_torch.export import c, fis, graph, policy
 from sofnn_torch.runs import checkpoint
 from sofnn_torch.terminal import command, plural
 
@@ -33,6 +34,7 @@ WRITERS: dict[str, Callable[[dict[str, Any], Path, str], bytes]] = {
     ".json": lambda data, *_: policy.to_json(data),
     ".h": c.to_header,
     ".onnx": graph.to_onnx,
+    ".fis": fis.to_fis,
 }
 
 
@@ -44,10 +46,12 @@ class Options(Settings):
     """Directory of the run, one of its checkpoint files, or a file that this command wrote."""
     to: tuple[Path, ...]
     """Files to write; their endings say in which formats: .json (and a file that plays it with
-    NumPy alone), .h (C99), .onnx."""
+    NumPy alone), .h (C99), .onnx, .fis (MATLAB, Octave)."""
     precision: Literal["float", "int16"] = "float"
     """Numbers of the C header: `float`, with math.h, or `int16`, whole numbers without any
     library."""
+    like: Path | None = None
+    """Where RUN is a .fis file: the run or exported policy whose axes and actions it is for."""
     best: bool = False
     """Take the checkpoint with the best last 10 trials instead of the latest."""
 
@@ -67,20 +71,22 @@ def check(options: Options) -> None:
             raise ValueError(f"--to {path}: not a file in an existing directory")
     if options.precision != "float" and not any(p.suffix.lower() == ".h" for p in options.to):
         raise ValueError("--precision is for a C header: give --to a file that ends in .h")
+    if (options.run.suffix.lower() == ".fis") != bool(options.like):
+        raise ValueError("--like RUN and a .fis file as source need each other")
     if options.best and options.run.suffix.lower() in READERS:
         raise ValueError(f"--best chooses a checkpoint of a run, and {options.run} is a policy")
 
 
-def source(options: Options) -> dict[str, Any]:
-    """The policy to write, as plain data.
+def source(path: Path, options: Options) -> dict[str, Any]:
+    """The policy of a run or a file, as plain data.
 
     Raises:
         ValueError: one line on a run or a file that cannot be used.
     """
-    reader = READERS.get(options.run.suffix.lower())
-    if reader and not options.run.is_dir():
-        return reader(options.run)
-    loaded = load(options.run, options.best)
+    reader = READERS.get(path.suffix.lower())
+    if reader and not path.is_dir():
+        return reader(path)
+    loaded = load(path, options.best)
     return policy.describe(loaded.config, loaded.agent)
 
 
@@ -92,7 +98,11 @@ def run(options: Options) -> None:
         OSError: a file cannot be written.
     """
     check(options)
-    data = source(options)
+    data = source(options.like or options.run, options)
+    if options.like:
+        if "fixed" in data:
+            raise ValueError(f"--like {options.like} holds rounded numbers: take the run itself")
+        data = fis.as_policy(fis.read(options.run), data)
     if "fixed" in data and any(path.suffix.lower() != ".h" for path in options.to):
         raise ValueError(f"{options.run} holds rounded numbers: export the run itself")
     written = [

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 from torch.nn import Parameter
-from torch.optim import LBFGS, Adagrad, Optimizer
+from torch.optim import LBFGS, Adagrad, Optimizer, Rprop
 
 
 class Followers:
@@ -35,9 +35,9 @@ class Followers:
         Raises:
             ValueError: it has none of the parameters, or keeps no state rule by rule.
         """
-        if isinstance(optimizer, LBFGS | Adagrad):  # one vector of all; made once at the start
+        if isinstance(optimizer, LBFGS | Adagrad | Rprop):  # what it keeps does not begin at zero
             kind = type(optimizer).__name__
-            raise ValueError(f"{kind} keeps no state rule by rule: it cannot follow growth")
+            raise ValueError(f"{kind} has no state for a rule that is new: it cannot follow growth")
         if not any(_group(optimizer, p) for p in parameters):
             raise ValueError("the optimizer has no parameter of this network")
         if any(optimizer is other for other in self):

@@ -174,7 +174,7 @@ class RuleStore(nn.Module):
         starts without. Copies of the network and of the optimizer do not follow.
 
         Raises:
-            ValueError: it has no parameter of this network, or is LBFGS or Adagrad.
+            ValueError: it has no parameter of this network, or is LBFGS, Adagrad or Rprop.
         """
         if self._followers.add(optimizer, list(self.parameters())):
             optimizer.register_step_post_hook(lambda *_: self._keep_widths())
