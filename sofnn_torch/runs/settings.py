@@ -169,7 +169,7 @@ class Config(Settings):
             )
         except ValueError as error:
             raise ValueError(f"--env {error}") from None
-        tables = presets.task_tables(agent, self.network, len(found.axes))
+        tables = presets.task_tables(agent, self.network, found)
         axes = tuple((a.name, a.unit, a.low, a.high, a.period) for a in found.axes)
         return tables | {"axes": axes, "reward_scale": found.reward_scale}
 
