@@ -397,10 +397,11 @@ def for_env(
     found = _found(env, given.seed, axes, scale)
     tables = presets.task_tables(name, network, found)
     tables["net"] = dataclasses.replace(tables["net"], **(net or {}))
+    own: dict[str, Any] = {}
     if (table := learner.Settings.table) in tables:
-        tables[table], own = dataclasses.replace(tables[table], **settings), ()
+        tables[table] = dataclasses.replace(tables[table], **settings)
     else:
-        own = tuple(settings.items())
+        own = settings
     spec = getattr(env, "spec", None)
     values = {
         "env": spec.id if spec else f"{type(env).__module__}:{type(env).__qualname__}",
@@ -409,7 +410,7 @@ def for_env(
         "seed": given.seed,
         "axes": [dataclasses.astuple(axis) for axis in found.axes],
         "reward_scale": found.reward_scale,
-        "own": own,
+        "own": tuple(own.items()),
     }
     defaults = {field.name: field.default for field in dataclasses.fields(Config)}
     plain = {part: dataclasses.asdict(settings) for part, settings in tables.items()}
