@@ -13,6 +13,7 @@ from gymnasium.envs.registration import register
 if TYPE_CHECKING:
     from sofnn_torch.evaluate import load
     from sofnn_torch.learners import SGA, Learner, QConfig, QLearning, SGAConfig, Task
+    from sofnn_torch.library import Agent
     from sofnn_torch.maze.env import KheperaMazeEnv
     from sofnn_torch.maze.settings import MazeConfig
     from sofnn_torch.network.axes import Axis
@@ -33,12 +34,14 @@ PLACES = {
     "runs.session": ("RunOptions",),
     "training": ("train", "resume"),
     "evaluate": ("load",),
+    "library": ("Agent",),
 }
 HOMES = {name: f"sofnn_torch.{module}" for module, names in PLACES.items() for name in names}
 
 __all__ = [
     "SGA",
     "SOFNN",
+    "Agent",
     "Axis",
     "Config",
     "KheperaMazeEnv",

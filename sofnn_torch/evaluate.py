@@ -23,6 +23,7 @@ from typing import Annotated, Any, NamedTuple
 if __name__ == "__main__":  # Ctrl-C while libraries load
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
+import gymnasium
 import numpy as np
 import tyro
 from rich.console import Console
@@ -161,18 +162,30 @@ def evaluate(
     """
     env = make_env(config, render_mode=render_mode)
     try:
-        seeding.begin(env, agent, seed)
-        records: list[TrialRecord] = []
-        with Progress("evaluation", episodes, quiet=quiet) as progress:
-            for trial in range(1, episodes + 1):
-                record, _ = play(env, agent, learn=False, explore=explore)
-                records.append(dataclasses.replace(record, trial=trial))
-                mean = sum(r.outcome for r in records) / trial
-                said = f"return {mean:,.4g}" if record.success is None else f"goal in {mean:.0%}"
-                progress.update(facts=[said, f"{record.steps} steps"])
-        return records
+        return played(env, agent, episodes, explore, seed, quiet)
     finally:
         env.close()
+
+
+def played(
+    env: gymnasium.Env[Any, Any],
+    agent: Learner,
+    episodes: int,
+    explore: bool,
+    seed: int,
+    quiet: bool,
+) -> list[TrialRecord]:
+    """Play trials without learning in an environment; arguments as in `evaluate`."""
+    seeding.begin(env, agent, seed)
+    records: list[TrialRecord] = []
+    with Progress("evaluation", episodes, quiet=quiet) as progress:
+        for trial in range(1, episodes + 1):
+            record, _ = play(env, agent, learn=False, explore=explore)
+            records.append(dataclasses.replace(record, trial=trial))
+            mean = sum(r.outcome for r in records) / trial
+            said = f"return {mean:,.4g}" if record.success is None else f"goal in {mean:.0%}"
+            progress.update(facts=[said, f"{record.steps} steps"])
+    return records
 
 
 def mean(values: Sequence[float], seed: int = 0) -> Estimate:

@@ -7,6 +7,7 @@ numbers. So nothing that is learned or logged depends on when a run was interrup
 
 import dataclasses
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -152,7 +153,7 @@ def _loop(session: Session, options: RunOptions, trap: SignalTrap) -> Path:
             if agent.net.refused:
                 rules = plural(agent.net.max_rules, "rule")
                 run.warn("cap", f"{rules} reached (--net.max-rules): no more are added")
-            progress.update(seconds=seconds, facts=_summary(record, session.state, speed))
+            progress.update(seconds=seconds, facts=summary(record, session.state["recent"], speed))
     except Interrupted as stop:
         stop.run = run.path
         raise
@@ -173,12 +174,18 @@ def _loop(session: Session, options: RunOptions, trap: SignalTrap) -> Path:
     return run.path
 
 
-def _summary(record: TrialRecord, state: dict[str, Any], speed: float) -> list[str]:
-    """What the progress shows, the most important first."""
+def summary(record: TrialRecord, recent: Sequence[Any], speed: float) -> list[str]:
+    """What the progress shows of a trial, the most important first.
+
+    Args:
+        record: the trial.
+        recent: outcome and steps of the last trials.
+        speed: steps in a second.
+    """
     outcome = f"{record.steps} steps" if record.success else "no goal"
-    recent = [outcome for outcome, _ in state["recent"]]
-    share = f"goal in {sum(recent)} of {len(recent)}"
+    outcomes = [outcome for outcome, _ in recent]
+    share = f"goal in {sum(outcomes)} of {len(outcomes)}"
     if record.success is None:
         outcome = f"return {record.reward:,.4g}"
-        share = f"{sum(recent) / len(recent):,.4g} in the last {len(recent)}"
+        share = f"{sum(outcomes) / len(outcomes):,.4g} in the last {len(outcomes)}"
     return [f"{speed:,.0f} steps/s", share, outcome, plural(record.rules, "rule")]

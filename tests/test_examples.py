@@ -2,18 +2,20 @@
 
 import doctest
 import importlib
+import math
 import pkgutil
 import re
 import runpy
 from pathlib import Path
 
+import gymnasium
 import pytest
 
-from sofnn_torch import bounds, learners, network
+from sofnn_torch import bounds, learners, library, network
 from sofnn_torch.runs import settings
 
 ROOT = Path(__file__).parents[1]
-MODULES = [bounds, settings] + [
+MODULES = [bounds, library, settings] + [
     importlib.import_module(found.name)
     for room in (network, learners)
     for found in pkgutil.iter_modules(room.__path__, f"{room.__name__}.")
@@ -44,3 +46,29 @@ def test_a_function_is_fitted_while_the_network_grows(capsys):
     assert constant == pytest.approx(0.415, abs=0.01)
     assert error < 0.03
     assert 15 < rules < 60
+
+
+def example(name):
+    return runpy.run_path(str(ROOT / "examples" / f"{name}.py"))
+
+
+def test_a_robot_behind_a_socket_learns_the_shortest_way(capsys):
+    example("own_loop")["main"]()
+    first, last = map(int, re.findall(r"\d+", capsys.readouterr().out))
+    assert first > 40 and last < 25  # 0.8 m by commands of 40 to 60 mm
+
+
+def test_a_task_of_gymnasium_is_learned_in_a_few_lines(capsys):
+    example("gymnasium_task")["main"](trials=3)
+    first, learned = map(int, re.findall(r"(\d+)(?: in|  *learned)", capsys.readouterr().out))
+    assert first > 0 and learned > 0
+
+
+def test_a_reward_and_an_observation_of_ones_own(capsys):
+    parts = example("own_reward")
+    env = parts["Angle"](parts["Height"](gymnasium.make("Pendulum-v1")))
+    seen, _ = env.reset(seed=0)
+    seen, reward, *_ = env.step([0.0])
+    assert seen in env.observation_space and reward == pytest.approx(math.cos(seen[0]), abs=1e-6)
+    parts["main"](trials=2)
+    assert capsys.readouterr().out.startswith("mean height -")

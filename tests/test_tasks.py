@@ -98,10 +98,10 @@ def test_actions_reach_the_ends_of_their_range(name):
     env = make(name)
     inner = env.env.action_space
     if isinstance(inner, Discrete):
-        taken = [env.inner_action(action) for action in range(len(env.action_names))]
+        taken = [env.translation.action(action) for action in range(len(env.action_names))]
         assert taken == list(range(inner.start, inner.start + inner.n))
     else:
-        low, high = (env.inner_action(np.full(inner.shape, end)) for end in (-1.0, 1.0))
+        low, high = (env.translation.action(np.full(inner.shape, end)) for end in (-1.0, 1.0))
         assert (low == inner.low).all() and (high == inner.high).all()
         assert inner.contains(low) and inner.contains(high)
 
@@ -110,7 +110,7 @@ def test_each_number_of_an_action_has_a_range_of_its_own():
     inner = Box(np.array([[-2.0, 0.0]]), np.array([[2.0, 10.0]]), dtype=np.float64)
     env = TaskEnv(Toy(actions=inner))
     assert env.action_space == Box(-1, 1, (2,))
-    action = env.inner_action(np.float32([0.5, -0.5]))
+    action = env.translation.action(np.float32([0.5, -0.5]))
     np.testing.assert_array_equal(action, [[1.0, 2.5]])
     assert inner.contains(action)
 
@@ -129,12 +129,12 @@ def test_observations_are_flat_float32_and_end_where_their_axes_end():
     )
     seen = [env.reset(seed=seed)[0] for seed in range(20)]
     assert {x.shape for x in seen} == {(4,)} and {x.dtype for x in seen} == {np.dtype(np.float32)}
-    assert np.abs(seen).max() == 1.0 and np.isnan(env._vector([np.nan] * 4)).all()
+    assert np.abs(seen).max() == 1.0 and np.isnan(env.translation.states([np.nan] * 4)).all()
 
 
 def test_an_axis_that_wraps_has_no_ends_to_stop_at():
     env = TaskEnv(Toy(), [Axis("a", "rad", -1, 1, period=2), Axis("b", "", -1, 1)])
-    assert env._vector([5.0, 5.0]).tolist() == [5.0, 1.0]
+    assert env.translation.states([5.0, 5.0]).tolist() == [5.0, 1.0]
 
 
 def test_each_trial_has_a_seed_of_its_own():

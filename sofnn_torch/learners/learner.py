@@ -10,7 +10,7 @@ from abc import ABC, abstractmethod
 from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import torch
@@ -21,6 +21,9 @@ from sofnn_torch.bounds import Settings
 from sofnn_torch.learners.memory import ReplayMemory
 from sofnn_torch.network.axes import Axis
 from sofnn_torch.network.sofnn import SOFNN
+
+if TYPE_CHECKING:
+    from sofnn_torch.library import Agent
 
 CHUNK = 512  # states at a time: memory stays near CHUNK x rules numbers
 
@@ -134,6 +137,31 @@ class Learner(ABC):
         self.value = 0.0
         self._log: dict[str, list[float]] = defaultdict(list)
         self.reseed(seed)
+
+    @classmethod
+    def for_env(cls, env: Any, seed: int = 0, **options: Any) -> "Agent":
+        """A learner for an environment: sizes and scales come from its spaces.
+
+        Args:
+            env: a Gymnasium environment, its id, or anything that has its spaces.
+            seed: of the agent's chance, and of the trials of `learn`.
+            **options: settings of the learner by name, and ``network``: ``sofnn`` or ``fixed``;
+                ``net``: settings of the network by name; ``axes``: of all inputs in their order;
+                ``reward_scale``. Where axes have no ends, or nothing is known of the rewards, 2,000
+                steps of random play in the environment say both.
+
+        Raises:
+            ValueError: spaces or settings that are not supported.
+
+        Example:
+            >>> from sofnn_torch import QLearning
+            >>> agent = QLearning.for_env("CartPole-v1", seed=0, temperature=0.01)
+            >>> agent.learner.task.actions
+            ('push left', 'push right')
+        """
+        from sofnn_torch.library import for_env
+
+        return for_env(cls, env, seed, **options)
 
     # ------------------------------------------------------------------------------- learning
 

@@ -1,11 +1,13 @@
 """Settings of the network."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
 from sofnn_torch.bounds import Positive, Settings, Within
+from sofnn_torch.network.axes import Axis
 from sofnn_torch.network.growth import criterion
 
 Rules = Annotated[int, Within(above=0)]
@@ -46,3 +48,33 @@ class NetworkConfig(Settings, table="net"):
         """Check the numbers, and that there is such a criterion."""
         super().__post_init__()
         criterion(self.growth, self.theta)
+
+    def task_widths(self, axes: Sequence[Axis], acting: bool = False) -> list[float]:
+        """Widths of new membership functions on axes with ends, in their units.
+
+        Args:
+            axes: of the state.
+            acting: the action is one more input.
+
+        Raises:
+            ValueError: `width` has neither one value nor one for each axis.
+        """
+        shares = _each(self.width, len(axes), "--net.width")
+        widths = [v * (axis.high - axis.low) for v, axis in zip(shares, axes, strict=True)]
+        return [*widths, self.width_action] if acting else widths
+
+    def along(self, inputs: int, acting: bool = False) -> tuple[int, ...]:
+        """Rules of the fixed network along each of the inputs of a state, and along the action.
+
+        Raises:
+            ValueError: `grid` has neither one value nor one for each input.
+        """
+        along = _each(self.grid, inputs, "--net.grid")
+        return (*along, self.grid_action) if acting else along
+
+
+def _each(values: tuple[Any, ...], count: int, name: str) -> tuple[Any, ...]:
+    """The values for each of the inputs, from as many or from one for all."""
+    if len(values) not in (1, count):
+        raise ValueError(f"{name} needs {count} values or one, got {len(values)}")
+    return values * count if len(values) == 1 else values

@@ -10,7 +10,7 @@ import functools
 import gc
 import io
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from contextlib import suppress
 from pathlib import Path
 
@@ -40,6 +40,31 @@ TAGS = {
     "pose_error_max": "pose/error_max",
     "heading_error": "pose/heading_error_mean",
 }
+
+
+def scalars(
+    record: TrialRecord, successes: Collection[float], steps_per_second: float
+) -> list[Summary.Value]:
+    """The curves' values after a trial.
+
+    Args:
+        record: the trial.
+        successes: whether each of the last trials was one; of a task that says so.
+        steps_per_second: simulator steps over wall-clock time of the trial.
+    """
+    values: dict[str, float] = {
+        "trial/steps": record.steps,
+        "trial/decisions": record.decisions,
+        "trial/return": record.reward,
+        "trial/total_steps": record.total_steps,
+        "rules/count": record.rules,
+        "speed/steps_per_second": steps_per_second,
+    }
+    if record.success is not None:
+        values["trial/success"] = float(record.success)
+        values["trial/success_last_10"] = sum(successes) / len(successes)
+    values |= {TAGS.get(k, f"trial/{k}"): v for k, v in record.measures.items()}
+    return [Summary.Value(tag=k, simple_value=v) for k, v in (values | record.statistics).items()]
 
 
 class Monitor:
@@ -138,22 +163,8 @@ class Monitor:
         events = self._events
         if events is None or not events.path.exists():  # the disk failed, or deleted
             events = self._open(record.trial)
-        values: dict[str, float] = {
-            "trial/steps": record.steps,
-            "trial/decisions": record.decisions,
-            "trial/return": record.reward,
-            "trial/total_steps": record.total_steps,
-            "rules/count": record.rules,
-            "speed/steps_per_second": steps_per_second,
-        }
-        if record.success is not None:
-            values["trial/success"] = float(record.success)
-            values["trial/success_last_10"] = sum(self.successes) / len(self.successes)
-        values |= {TAGS.get(k, f"trial/{k}"): v for k, v in record.measures.items()}
-        scalars = [
-            Summary.Value(tag=k, simple_value=v) for k, v in (values | record.statistics).items()
-        ]
-        events.add(Summary(value=scalars), record.trial)
+        values = scalars(record, self.successes, steps_per_second)
+        events.add(Summary(value=values), record.trial)
         events.flush()
 
     @functools.cached_property

@@ -1,12 +1,14 @@
 """From settings to objects, one way for all: training, evaluation and analysis cannot disagree."""
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
-from sofnn_torch.learners.learner import Learner
+from sofnn_torch.learners.learner import Learner, Task
 from sofnn_torch.maze.env import KheperaMazeEnv
 from sofnn_torch.maze.plan import MazePlan
 from sofnn_torch.maze.robot import plan_of
+from sofnn_torch.network.settings import NetworkConfig
 from sofnn_torch.network.sofnn import SOFNN, grid
 from sofnn_torch.runs.settings import MAZE, Config
 from sofnn_torch.tasks.env import TaskEnv, make
@@ -37,16 +39,56 @@ def make_plan(config: Config) -> MazePlan:
 
 def make_agent(config: Config) -> Learner:
     """The learner and its network that the settings describe, with no rule learned yet."""
-    net, settings = config.net, config.learner_settings
-    axes, outputs = config.learner.layout(settings, config.task)
+    return assemble(
+        config.learner,
+        config.task,
+        config.learner_settings,
+        config.net,
+        config.widths,
+        config.grid if config.network == "fixed" else None,
+        config.seed,
+        least=1e-3 if config.env == MAZE else least_width(config.widths),
+    )
+
+
+def least_width(widths: Sequence[float]) -> float:
+    """Bound of the widths in any task: some measure in units of which 0.001 is a long way."""
+    return min(1e-3, min(widths) / 100)
+
+
+def assemble(
+    learner: type[Learner],
+    task: Task,
+    settings: Any,
+    net: NetworkConfig,
+    widths: Sequence[float],
+    along: Sequence[int] | None,
+    seed: int,
+    least: float,
+) -> Learner:
+    """A learner on a network of its own.
+
+    Args:
+        learner: its class.
+        task: what is learned.
+        settings: of the learner.
+        net: settings of the network.
+        widths: of new membership functions on each input of the network.
+        along: rules along each input for a fixed network; None for a growing one.
+        seed: of the learner.
+        least: no width becomes smaller.
+
+    Raises:
+        ValueError: settings that do not go together.
+    """
+    axes, outputs = learner.layout(settings, task)
     common: dict[str, Any] = {
-        "width": config.widths,
+        "width": widths,
         "initial": [output.initial for output in outputs],
+        "min_width": least,
     }
-    if config.env != MAZE:  # some tasks measure in units of which a thousandth is a long way
-        common["min_width"] = min(1e-3, min(config.widths) / 100)
-    if config.network == "fixed":
-        network = grid(axes, config.grid, len(outputs), **common)
+    if along is not None:
+        network = grid(axes, along, len(outputs), **common)
     else:
         network = SOFNN(
             axes,
@@ -57,4 +99,4 @@ def make_agent(config: Config) -> Learner:
             max_rules=net.max_rules,
             **common,
         )
-    return config.learner(network, config.task, settings, config.seed)
+    return learner(network, task, settings, seed)

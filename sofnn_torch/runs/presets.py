@@ -11,6 +11,7 @@ from sofnn_torch.learners.qlearning import QConfig
 from sofnn_torch.learners.sga import SGAConfig
 from sofnn_torch.maze.settings import MazeConfig
 from sofnn_torch.network.settings import NetworkConfig
+from sofnn_torch.tasks.env import Spaces
 
 TABLES = ("net", "sga", "q", "maze")
 
@@ -20,12 +21,13 @@ def tables(agent: str, network: str, name: str) -> dict[str, Any]:
     return _paper(agent) if name == "paper" else _default(agent, network)
 
 
-def task_tables(agent: str, network: str, inputs: int) -> dict[str, Any]:
-    """The tables of the preset ``default`` for a task with as many inputs.
+def task_tables(agent: str, network: str, found: Spaces) -> dict[str, Any]:
+    """The tables of the preset ``default`` for a task with these spaces.
 
     The square of a distance grows with the number of inputs, and so do the squares of the widths
     beyond two inputs. A grid has about a thousand rules and widths of half its spacing.
     """
+    inputs = len(found.axes)
     along = max(2, int(1000 ** (1 / inputs) + 1e-9))
     sharpness = 0.07 if agent == "q" else 0.1  # greedy action values need sharper sets
     width = sharpness * max(1.0, math.sqrt(inputs / 2)) if network == "sofnn" else 0.5 / along

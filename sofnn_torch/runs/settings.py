@@ -125,7 +125,7 @@ class Config(Settings):
             idle["own"] = f"with --agent {self.agent}"
         if self.task.discrete:
             idle["q.segments"] = "with --maze.actions three" if self.env == MAZE else elsewhere
-        fixed, acting = self.network == "fixed", len(self._inputs) > len(self.task.axes)
+        fixed, acting = self.network == "fixed", self._acting
         idle |= dict.fromkeys(
             ("axes", "reward_scale") if self.env == MAZE else ("maze", "pose"), elsewhere
         )
@@ -144,18 +144,15 @@ class Config(Settings):
     def widths(self) -> list[float]:
         """Width of new membership functions on each input of the network, in its unit."""
         net, axes = self.net, self.task.axes
-        if self.env == MAZE:
-            widths = [net.width_heading if a.period else net.width_position for a in axes]
-        else:
-            shares = _each(net.width, len(axes), "--net.width")
-            widths = [v * (a.high - a.low) for v, a in zip(shares, axes, strict=True)]
-        return [*widths, net.width_action][: len(self._inputs)]
+        if self.env != MAZE:
+            return net.task_widths(axes, self._acting)
+        widths = [net.width_heading if a.period else net.width_position for a in axes]
+        return [*widths, net.width_action] if self._acting else widths
 
     @property
     def grid(self) -> tuple[int, ...]:
         """Rules along each input of the fixed network."""
-        along = _each(self.net.grid, len(self.task.axes), "--net.grid")
-        return (*along, self.net.grid_action)[: len(self._inputs)]
+        return self.net.along(len(self.task.axes), self._acting)
 
     def _preset(self) -> dict[str, Any]:
         """The values of what is not given."""
@@ -172,13 +169,15 @@ class Config(Settings):
             )
         except ValueError as error:
             raise ValueError(f"--env {error}") from None
-        tables = presets.task_tables(agent, self.network, len(found.axes))
+        tables = presets.task_tables(agent, self.network, found)
         axes = tuple((a.name, a.unit, a.low, a.high, a.period) for a in found.axes)
         return tables | {"axes": axes, "reward_scale": found.reward_scale}
 
     @property
-    def _inputs(self) -> tuple[Axis, ...]:
-        return self.learner.layout(self.learner_settings, self.task)[0]
+    def _acting(self) -> bool:
+        """The action is one more input of the network."""
+        inputs, _ = self.learner.layout(self.learner_settings, self.task)
+        return len(inputs) > len(self.task.axes)
 
     def _check_axes(self) -> None:
         """Raise ValueError on axes that are none, or not those of the environment."""
@@ -206,20 +205,13 @@ class Config(Settings):
                 f"{flag(settings.table, 'value_limit')} {limit:g} must be at least "
                 f"--maze.goal-reward {reward:g}, or None"
             )
-        _each(self.net.width, len(self.task.axes), "--net.width")
-        self._inputs  # noqa: B018 - checks that the learner can do the task
+        self.net.task_widths(self.task.axes)
+        self._acting  # noqa: B018 - checks that the learner can do the task
         shape = self.grid if self.network == "fixed" else ()
         if math.prod(shape) > self.net.max_rules:
             raise ValueError(
                 f"--net.grid {shape} has more rules than --net.max-rules {self.net.max_rules}"
             )
-
-
-def _each(values: tuple[Any, ...], count: int, name: str) -> tuple[Any, ...]:
-    """The values for each of the inputs, from as many or from one for all."""
-    if len(values) not in (1, count):
-        raise ValueError(f"{name} needs {count} values or one, got {len(values)}")
-    return values * count if len(values) == 1 else values
 
 
 def from_dict(data: Any) -> Config:

@@ -37,6 +37,41 @@ class Spaces:
     reward_scale: float | None = None
 
 
+class Translation:
+    """Observations of an environment as a learner takes them, and its actions for the environment.
+
+    Args:
+        shape: of an observation.
+        acted: the space of the actions.
+        axes: of the numbers of an observation, in their order.
+    """
+
+    def __init__(self, shape: Sequence[int], acted: Box | Discrete, axes: Sequence[Axis]):
+        self.shape, self.acted = tuple(shape), acted
+        free = [axis.period > 0 for axis in axes]
+        self.low = np.where(free, -np.inf, [axis.low for axis in axes])
+        self.high = np.where(free, np.inf, [axis.high for axis in axes])
+
+    def states(self, observations: Any) -> NDArray[np.float32]:
+        """The numbers of observations, at most at the ends of their axes. Shape: (.., n).
+
+        Args:
+            observations: one of the shape of the space, or many. Shape: (.., *shape).
+        """
+        numbers = np.asarray(observations, np.float64)
+        many = numbers.shape[: numbers.ndim - len(self.shape)]
+        return np.clip(numbers.reshape(*many, -1), self.low, self.high).astype(np.float32)
+
+    def action(self, action: Any) -> Any:
+        """The action of the environment that an action of a learner stands for."""
+        space = self.acted
+        if isinstance(space, Discrete):
+            return space.start + space.dtype.type(action)
+        share = (np.asarray(action, np.float64).reshape(space.shape) + 1) / 2
+        low, high = space.low.astype(np.float64), space.high.astype(np.float64)
+        return np.clip(low + share * (high - low), low, high).astype(space.dtype)
+
+
 class TaskEnv(gymnasium.Env[NDArray[np.float32], Any]):
     """An environment with a vector as observation and actions in [-1, 1] or from 0 on.
 
@@ -64,13 +99,13 @@ class TaskEnv(gymnasium.Env[NDArray[np.float32], Any]):
         found = spaces(env)
         self.env, self.metadata, self.render_mode = env, env.metadata, env.render_mode
         self.axes = tuple(axes or found.axes)
-        self.action_names, self._acted = found.actions, _actions(env.action_space)
+        self.action_names = found.actions
         if len(self.axes) != len(found.axes):
             raise ValueError(f"{len(found.axes)} inputs need as many axes, got {len(self.axes)}")
-        free = [axis.period > 0 for axis in self.axes]
-        self._low = np.where(free, -np.inf, [axis.low for axis in self.axes])
-        self._high = np.where(free, np.inf, [axis.high for axis in self.axes])
-        self.observation_space = Box(np.float32(self._low), np.float32(self._high))
+        shape = env.observation_space.shape or ()
+        self.translation = Translation(shape, _actions(env.action_space), self.axes)
+        low, high = self.translation.low, self.translation.high
+        self.observation_space = Box(np.float32(low), np.float32(high))
         count = len(found.actions)
         self.action_space = Discrete(count) if found.discrete else Box(-1.0, 1.0, (count,))
         self.seed = int(np.random.SeedSequence().generate_state(1)[0])
@@ -84,27 +119,19 @@ class TaskEnv(gymnasium.Env[NDArray[np.float32], Any]):
         own = np.random.SeedSequence([self.seed, self.trial]).generate_state(1)[0]
         observation, info = self.env.reset(seed=int(own), options=options)
         self.steps = 0
-        return self._vector(observation), self._info(info)
+        return self.translation.states(observation).ravel(), self._info(info)
 
     def step(self, action: Any) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
         """Take an action; return observation, reward, terminated, truncated, info.
 
         The info has ``total_steps``, and ``success`` where the environment says whether it was one.
         """
-        observation, reward, terminated, truncated, info = self.env.step(self.inner_action(action))
+        chosen = self.translation.action(action)
+        observation, reward, terminated, truncated, info = self.env.step(chosen)
         self.steps += 1
         truncated = bool(truncated) or (self.steps >= LONGEST and not terminated)
-        after = self._vector(observation), float(reward), bool(terminated), truncated
-        return *after, self._info(info)
-
-    def inner_action(self, action: Any) -> Any:
-        """The action of the inner environment that an action of this one stands for."""
-        space = self._acted
-        if isinstance(space, Discrete):
-            return space.start + space.dtype.type(action)
-        share = (np.asarray(action, np.float64).reshape(space.shape) + 1) / 2
-        low, high = space.low.astype(np.float64), space.high.astype(np.float64)
-        return np.clip(low + share * (high - low), low, high).astype(space.dtype)
+        state = self.translation.states(observation).ravel()
+        return state, float(reward), bool(terminated), truncated, self._info(info)
 
     def measure(self, infos: Sequence[dict[str, Any]]) -> dict[str, float]:
         """What else is measured in a trial: nothing."""
@@ -132,10 +159,6 @@ class TaskEnv(gymnasium.Env[NDArray[np.float32], Any]):
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Counterpart of `state_dict`."""
         self.seed, self.trial = state["seed"], state["trial"]
-
-    def _vector(self, observation: Any) -> NDArray[np.float32]:
-        numbers = np.asarray(observation, np.float64).ravel()
-        return np.clip(numbers, self._low, self._high).astype(np.float32)
 
     def _info(self, info: dict[str, Any]) -> dict[str, Any]:
         said = info.get("is_success", info.get("success"))
@@ -188,7 +211,8 @@ def spaces(env: gymnasium.Env) -> Spaces:
     observed, acted = _observations(env.observation_space), _actions(env.action_space)
     discrete = isinstance(acted, Discrete)
     number = int(acted.n) if isinstance(acted, Discrete) else acted.low.size
-    known = KNOWN.get(env.spec.name) if env.spec else None
+    spec = getattr(env, "spec", None)
+    known = KNOWN.get(spec.name) if spec else None
     if known and (len(known.axes), len(known.actions)) == (observed.low.size, number):
         return Spaces(known.axes, known.actions, discrete, known.reward_scale)
     names = tuple(f"action {j + 1}" for j in range(number)) if number > 1 else ("action",)
