@@ -59,10 +59,12 @@ def test_the_observation_is_the_pose_that_was_asked_for(kind):
     observation, info = env.reset(seed=0, options={"pose": (0.4, 0.5, 0.0)})  # far from landmarks
     known = "true_pose" if kind.get("pose") == "true" else "estimated_pose"
     env.action_space.seed(0)
-    for _ in range(5):
+    differed = False
+    for _ in range(30):  # a landmark near it makes both equal for a while
         np.testing.assert_array_equal(observation[:3], np.float32(info[known]))
         observation, *_, info = env.step(env.action_space.sample())
-    assert (info["true_pose"] != info["estimated_pose"]).any()
+        differed |= bool((info["true_pose"] != info["estimated_pose"]).any())
+    assert differed
 
 
 @every_kind

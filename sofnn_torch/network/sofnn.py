@@ -257,7 +257,7 @@ class SOFNN(RuleTable):
 
     def _precise(self, x: Tensor) -> Tensor:
         """States of any type in that of the network, but never in half precision."""
-        dtype = self._usage.dtype
+        dtype = self._store["table"].dtype  # a view is made anew after each rule
         if x.dtype == dtype and dtype.itemsize > 2:
             return x
         return x.to(torch.promote_types(dtype, torch.float32))
