@@ -4,6 +4,7 @@ import dataclasses
 
 import gymnasium
 import numpy as np
+import pytest
 import torch
 from gymnasium.spaces import Box, Discrete
 
@@ -54,6 +55,8 @@ KINDS = {
     "sheet": {"env": "Sheet-v0"},
     "counted": {"env": "SheetCounted-v0"},
 }
+FEW = ("three", "wheels", "q scalar", "q antecedent", "pole q", "pendulum")  # each way to decide
+ALL = [kind if kind in FEW else pytest.param(kind, marks=pytest.mark.slow) for kind in KINDS]
 
 
 def learner(kind="three", rules=40, seed=0, axes_only=False, steps=3000):

@@ -8,7 +8,7 @@ import subprocess
 import numpy as np
 import pytest
 import torch
-from exported import KINDS, learner, states
+from exported import ALL, learner, states
 from test_export import command, margins  # noqa: F401
 
 from sofnn_torch.export import c, fixed, policy, runtime
@@ -52,7 +52,7 @@ def answers(main, x, kind):
 
 
 @needs_gcc
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", ALL)
 def test_the_float_header_decides_as_torch(tmp_path, kind):
     _, data, (_, agent) = header(tmp_path, kind, "float")
     ours, x = runtime.Policy(data), states(agent, 500)
@@ -114,7 +114,7 @@ def starts(count):
 
 
 @needs_gcc
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", ALL)
 def test_the_header_in_whole_numbers_is_its_model_bit_for_bit(tmp_path, kind):
     equal_to_the_model(tmp_path, kind, 3000)
 
@@ -126,7 +126,7 @@ def test_the_header_in_whole_numbers_is_its_model_at_a_million_states(tmp_path, 
     equal_to_the_model(tmp_path, kind, 1_000_000)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", ALL)
 def test_whole_numbers_decide_as_the_network_but_near_an_edge(kind):
     config, agent = learner(kind, axes_only=True)
     data = policy.describe(config, agent)

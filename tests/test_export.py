@@ -8,7 +8,7 @@ import sys
 import numpy as np
 import pytest
 import torch
-from exported import KINDS, learner, states
+from exported import ALL, KINDS, learner, states
 from own import Sarsa, SarsaConfig
 
 from sofnn_torch.export import __main__ as export
@@ -65,7 +65,7 @@ def margins(ours, x):
     return np.abs(ours.outputs(x)[:, :1] - np.array(edges)).min(1)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", ALL)
 def test_whole_trials_are_those_of_the_evaluation_the_way_out_of_loops_included(kind):
     config, agent = learner(kind, rules=12, steps=600)
     explore = kind in ("steer", "q", "pole q")
@@ -81,7 +81,7 @@ def test_whole_trials_are_those_of_the_evaluation_the_way_out_of_loops_included(
         while not done:
             if inner is not None:
                 assert inner.action_space.contains(ours.command(action))
-                np.testing.assert_array_equal(ours.command(action), env.inner_action(action))
+                np.testing.assert_array_equal(ours.command(action), env.translation.action(action))
             else:
                 np.testing.assert_allclose(ours.command(action), env.wheel_speeds(action))
             commands += 1

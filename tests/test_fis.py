@@ -5,7 +5,7 @@ import subprocess
 
 import numpy as np
 import pytest
-from exported import KINDS, learner, states
+from exported import ALL, learner, states
 from test_export import command  # noqa: F401
 
 from sofnn_torch.export import fis, policy, runtime
@@ -61,7 +61,7 @@ def other(tmp_path):
     return tmp_path / "other.fis", tmp_path / "like.json"
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", ALL)
 def test_a_written_system_concludes_as_the_policy_and_is_read_again(tmp_path, kind):
     config, agent = learner(kind)
     data, path = policy.describe(config, agent), tmp_path / "policy.fis"

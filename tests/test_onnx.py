@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from exported import KINDS, learner, states
+from exported import ALL, learner, states
 from test_export import command, margins  # noqa: F401
 
 from sofnn_torch.export import graph, policy, runtime
@@ -18,7 +18,7 @@ def session(content):
     return onnxruntime.InferenceSession(content, options)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", ALL)
 def test_a_graph_concludes_and_decides_as_torch_at_any_batch_size(kind):
     config, agent = learner(kind)
     data = policy.describe(config, agent)

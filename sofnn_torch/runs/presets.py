@@ -43,7 +43,15 @@ def task_tables(agent: str, network: str, found: Spaces) -> dict[str, Any]:
         initial_value=1.0,
         replays=20,
     )
-    q = QConfig(temperature=0.002, trace_decay=0.9, initial=1.0, value_limit=1.0)
+    # Optimistic, but no more than a state can be worth: where every step costs something, 0 is.
+    q = QConfig(
+        temperature=0.002,
+        trace_decay=0.9,
+        rate_action=0.3,
+        initial=found.best,
+        value_limit=found.best,
+        replays=20,
+    )
     return {"net": net, "sga": sga, "q": q, "maze": MazeConfig()}
 
 

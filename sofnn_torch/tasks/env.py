@@ -29,12 +29,14 @@ class Spaces:
         actions: names of the actions, or of the numbers that make one.
         discrete: one of the actions is chosen.
         reward_scale: so that values are about 1; None if the task is not known.
+        best: the most, so scaled, that a state can be worth as far as is known.
     """
 
     axes: tuple[Axis, ...]
     actions: tuple[str, ...]
     discrete: bool
     reward_scale: float | None = None
+    best: float = 1.0
 
 
 class Translation:
@@ -214,7 +216,7 @@ def spaces(env: gymnasium.Env) -> Spaces:
     spec = getattr(env, "spec", None)
     known = KNOWN.get(spec.name) if spec else None
     if known and (len(known.axes), len(known.actions)) == (observed.low.size, number):
-        return Spaces(known.axes, known.actions, discrete, known.reward_scale)
+        return Spaces(known.axes, known.actions, discrete, known.reward_scale, known.best)
     names = tuple(f"action {j + 1}" for j in range(number)) if number > 1 else ("action",)
     ends = zip(observed.low.ravel(), observed.high.ravel(), strict=True)
     pairs = [_ends(float(low), float(high)) for low, high in ends]

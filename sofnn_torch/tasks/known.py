@@ -20,11 +20,13 @@ class Known:
         axes: of its observation, all with ends.
         actions: names of its actions, or of the numbers that make one.
         reward_scale: of its rewards, so that values are about 1.
+        best: the most, so scaled, that any state can be worth.
     """
 
     axes: tuple[Axis, ...]
     actions: tuple[str, ...]
     reward_scale: float = STEP
+    best: float = 1.0
 
 
 CAR = Axis("position", "", -1.2, 0.6), Axis("velocity", "", -0.07, 0.07)
@@ -57,11 +59,11 @@ POLE = (
 
 # By the name in Gymnasium's registry, without the version.
 KNOWN = {
-    "MountainCar": Known(CAR, ("push left", "no push", "push right")),
+    "MountainCar": Known(CAR, ("push left", "no push", "push right"), best=0.0),
     "MountainCarContinuous": Known(CAR, ("push",)),
     "CartPole": Known(POLE, ("push left", "push right")),
-    "Acrobot": Known(ACROBOT, ("torque -1", "no torque", "torque +1")),
-    "Pendulum": Known(PENDULUM, ("torque",), STEP / 8),  # the cost of a step is 0 to 16.3
+    "Acrobot": Known(ACROBOT, ("torque -1", "no torque", "torque +1"), best=0.0),
+    "Pendulum": Known(PENDULUM, ("torque",), STEP / 8, 0.0),  # a step costs 0 to 16.3
     "LunarLander": Known(LANDER, ("nothing", "left engine", "main engine", "right engine")),
     "LunarLanderContinuous": Known(LANDER, ("main engine", "side engines")),
 }
