@@ -88,8 +88,14 @@ def assert_one_death_does_no_harm(case, kind, point, references, tmp_path):
     assert_same_end(run, reference)
 
 
-@pytest.mark.parametrize("kind", doomed.MOMENTS)
-@pytest.mark.parametrize("case", GROWING)
+@pytest.mark.parametrize(
+    "case,kind",
+    [
+        pytest.param(case, kind, marks=[pytest.mark.slow] * ((i + j) % 2))
+        for i, case in enumerate(GROWING)
+        for j, kind in enumerate(doomed.MOMENTS)
+    ],
+)
 def test_a_killed_run_resumes_bit_for_bit(case, kind, references, tmp_path):
     assert_one_death_does_no_harm(case, kind, 0, references, tmp_path)
 

@@ -14,7 +14,6 @@ from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Tu
 from sofnn_torch import evaluate, training
 from sofnn_torch.cli import main
 from sofnn_torch.network.axes import Axis
-from sofnn_torch.pictures.figures import read_column
 from sofnn_torch.pictures.film import film
 from sofnn_torch.rules import words
 from sofnn_torch.rules.__main__ import main as rules_main
@@ -364,11 +363,15 @@ def test_learners_see_scaled_rewards_and_records_the_real_ones(toy):
 @pytest.mark.slow
 @pytest.mark.parametrize("agent", ["sga", "q"])
 @pytest.mark.parametrize(
-    ("env", "trials", "random"), [("MountainCar-v0", 100, -200), ("CartPole-v1", 100, 22)]
+    ("env", "trials", "random"), [("MountainCar-v0", 150, -200), ("CartPole-v1", 120, 22)]
 )
-@pytest.mark.parametrize("seed", range(3))
-def test_the_defaults_learn(agent, env, trials, random, seed, tmp_path):
-    config = Config(env=env, agent=agent, seed=seed, trials=trials)
-    run = training.train(config, quick_options(tmp_path))
-    learned = read_column(run / "trials.csv", "reward")[-20:].mean()
-    assert learned > random + 20
+def test_the_defaults_learn(agent, env, trials, random, tmp_path):
+    """The greedy policies of most seeds are far from chance."""
+    returns = []
+    for seed in range(3):
+        config = Config(env=env, agent=agent, seed=seed, trials=trials)
+        run = training.train(config, quick_options(tmp_path / str(seed)))
+        config, learner, _, _ = evaluate.load(run)
+        records = evaluate.evaluate(config, learner, 10)
+        returns.append(sum(record.reward for record in records) / len(records))
+    assert sorted(returns)[1] > random + 25
