@@ -29,7 +29,7 @@ def task_tables(agent: str, network: str, found: Spaces) -> dict[str, Any]:
     """
     inputs = len(found.axes)
     along = max(2, int(1000 ** (1 / inputs) + 1e-9))
-    sharpness = 0.07 if agent == "q" else 0.1  # greedy action values need sharper sets
+    sharpness = (found.sharpness or 0.07) if agent == "q" else 0.1  # greedy values need sharp sets
     width = sharpness * max(1.0, math.sqrt(inputs / 2)) if network == "sofnn" else 0.5 / along
     net = NetworkConfig(
         theta=0.3 if agent == "q" else 0.4, width=(float(f"{width:.3g}"),), grid=(along,)

@@ -30,6 +30,7 @@ class Spaces:
         discrete: one of the actions is chosen.
         reward_scale: so that values are about 1; None if the task is not known.
         best: the most, so scaled, that a state can be worth as far as is known.
+        sharpness: width of the rules of action values, as a share of an axis; None for the usual.
     """
 
     axes: tuple[Axis, ...]
@@ -37,6 +38,7 @@ class Spaces:
     discrete: bool
     reward_scale: float | None = None
     best: float = 1.0
+    sharpness: float | None = None
 
 
 class Translation:
@@ -216,7 +218,8 @@ def spaces(env: gymnasium.Env) -> Spaces:
     spec = getattr(env, "spec", None)
     known = KNOWN.get(spec.name) if spec else None
     if known and (len(known.axes), len(known.actions)) == (observed.low.size, number):
-        return Spaces(known.axes, known.actions, discrete, known.reward_scale, known.best)
+        own = known.reward_scale, known.best, known.sharpness
+        return Spaces(known.axes, known.actions, discrete, *own)
     names = tuple(f"action {j + 1}" for j in range(number)) if number > 1 else ("action",)
     ends = zip(observed.low.ravel(), observed.high.ravel(), strict=True)
     pairs = [_ends(float(low), float(high)) for low, high in ends]

@@ -21,12 +21,14 @@ class Known:
         actions: names of its actions, or of the numbers that make one.
         reward_scale: of its rewards, so that values are about 1.
         best: the most, so scaled, that any state can be worth.
+        sharpness: width of the rules of action values, as a share of an axis; None for the usual.
     """
 
     axes: tuple[Axis, ...]
     actions: tuple[str, ...]
     reward_scale: float = STEP
     best: float = 1.0
+    sharpness: float | None = None
 
 
 CAR = Axis("position", "", -1.2, 0.6), Axis("velocity", "", -0.07, 0.07)
@@ -59,7 +61,7 @@ POLE = (
 
 # By the name in Gymnasium's registry, without the version.
 KNOWN = {
-    "MountainCar": Known(CAR, ("push left", "no push", "push right"), best=0.0),
+    "MountainCar": Known(CAR, ("push left", "no push", "push right"), best=0.0, sharpness=0.05),
     "MountainCarContinuous": Known(CAR, ("push",)),
     "CartPole": Known(POLE, ("push left", "push right")),
     "Acrobot": Known(ACROBOT, ("torque -1", "no torque", "torque +1"), best=0.0),
