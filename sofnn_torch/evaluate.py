@@ -43,7 +43,7 @@ from sofnn_torch.runs.provenance import versions
 from sofnn_torch.runs.session import arithmetic, saved_config
 from sofnn_torch.runs.settings import MAZE, Config
 from sofnn_torch.runs.trial import TrialRecord
-from sofnn_torch.terminal import command, plural, say
+from sofnn_torch.terminal import check_output, command, plural, say
 from sofnn_torch.training import play
 
 CONFIDENCE = 0.95
@@ -86,13 +86,10 @@ def check(options: Options) -> None:
     Raises:
         ValueError: naming the flag.
     """
-    if options.video and options.video.suffix.lower() not in (".mp4", ".gif"):
-        raise ValueError(f"--video must end in .mp4 or .gif, got {options.video}")
+    check_output("--video", options.video, (".mp4", ".gif"))
+    check_output("--json", options.json)
     if options.viewer and not has_display():
         raise ValueError("--viewer needs a display: without one use --video FILE")
-    for flag, path in (("--video", options.video), ("--json", options.json)):
-        if path and (path.is_dir() or not path.parent.is_dir()):
-            raise ValueError(f"{flag} {path}: not a file in an existing directory")
 
 
 class Loaded(NamedTuple):

@@ -443,9 +443,12 @@ def _made(config: dict[str, Any], found: Spaces) -> Learner:
     settings = read(dict(config["own"]) if own else config[table], learner.Settings, f"{table}.")
     net = read(config["net"], NetworkConfig, "net.")
     task = Task(
-        named(found.axes), found.actions, found.discrete, reward_scale=config["reward_scale"]
+        named(found.axes),
+        found.actions,
+        found.discrete,
+        reward_scale=config["reward_scale"],
+        patience=float("inf"),
     )
-    task = dataclasses.replace(task, patience=float("inf"))
     inputs, _ = learner.layout(settings, task)
     acting = len(inputs) > len(task.axes)
     widths = net.task_widths(task.axes, acting)

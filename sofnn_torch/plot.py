@@ -9,9 +9,7 @@ median over its seeds, a band from the first to the third quartile, and each see
 is of the last 10 trials of each run. Runs that are still learning can be drawn.
 """
 
-import csv
 import dataclasses
-import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,7 +26,8 @@ from sofnn_torch.pictures import figures
 from sofnn_torch.runs import checkpoint
 from sofnn_torch.runs.directory import flatten, load_config
 from sofnn_torch.runs.settings import MAZE
-from sofnn_torch.terminal import command, plural
+from sofnn_torch.runs.table import line
+from sofnn_torch.terminal import check_output, command, plural
 
 LAST = 10  # trials at the end of each run that the table tells of
 ENDINGS = (".png", ".svg", ".pdf")
@@ -130,13 +129,11 @@ def write_table(
     path: Path, groups: Mapping[str, Sequence[Path]], curves: Mapping[str, Sequence[NDArray[Any]]]
 ) -> None:
     """Write every point of every curve as CSV."""
-    buffer = io.StringIO()
-    rows = csv.writer(buffer, lineterminator="\n")
-    rows.writerow(["group", "run", "trial", "value"])
+    lines = [line(["group", "run", "trial", "value"])]
     for name, runs in groups.items():
         for run, curve in zip(runs, curves[name], strict=True):
-            rows.writerows([name, run.name, i, float(v)] for i, v in enumerate(curve, 1))
-    checkpoint.write_atomically(path, buffer.getvalue().encode())
+            lines += [line([name, run.name, i, float(v)]) for i, v in enumerate(curve, 1)]
+    checkpoint.write_atomically(path, "".join(lines).encode())
 
 
 def run(options: Options) -> None:
@@ -145,14 +142,8 @@ def run(options: Options) -> None:
     Raises:
         ValueError: a run cannot be used or a file cannot be written.
     """
-    kind = options.out.suffix.lower()
-    if kind not in ENDINGS:
-        raise ValueError(f"--out must end in {', '.join(ENDINGS)}, got {options.out}")
-    if options.csv and options.csv.suffix.lower() != ".csv":
-        raise ValueError(f"--csv must end in .csv, got {options.csv}")
-    for flag, path in (("--out", options.out), ("--csv", options.csv)):
-        if path and (path.is_dir() or not path.parent.is_dir()):
-            raise ValueError(f"{flag} {path}: not a file in an existing directory")
+    check_output("--out", options.out, ENDINGS)
+    check_output("--csv", options.csv, (".csv",))
     groups = group(find(options.runs))
     first = next(iter(groups.values()))[0]
     quantity = options.quantity or ("steps" if load_config(first).env == MAZE else "reward")
@@ -165,7 +156,7 @@ def run(options: Options) -> None:
     }
     figure, (ax,) = figures.canvas(width=6, height=3.6)
     figures.learning_curves(curves, ax, quantity, LABELS.get(quantity, quantity))
-    checkpoint.write_atomically(options.out, figures.saved(figure, kind[1:]))
+    checkpoint.write_atomically(options.out, figures.saved(figure, options.out.suffix.lower()[1:]))
     Console().print(summary(raw, quantity))
     print(f"written: {options.out} ({plural(sum(map(len, groups.values())), 'run')})")
     if options.csv:

@@ -20,7 +20,7 @@ from sofnn_torch.progress import say
 from sofnn_torch.runs.signals import Interrupted
 from sofnn_torch.streams import output
 
-__all__ = ["attempt", "command", "parse", "plural", "program", "quoted", "say"]
+__all__ = ["attempt", "check_output", "command", "parse", "plural", "program", "quoted", "say"]
 
 # Exit codes by what went wrong, the first that fits.
 FAILURES = dict.fromkeys((ValueError, OSError, RuntimeError, ArithmeticError), 2)
@@ -175,6 +175,23 @@ def quoted(path: Path | str) -> str:
     """A path for a command line that can be pasted into a shell."""
     text = str(path)
     return shlex.quote(f"./{text}" if text.startswith("-") else text)
+
+
+def check_output(flag: str, path: Path | None, endings: Sequence[str] = ()) -> None:
+    """Check that a file, if one is asked for, can be written, before work is done for it.
+
+    Args:
+        flag: that names the file.
+        path: of the file.
+        endings: that it may have, in any case; empty for any.
+
+    Raises:
+        ValueError: it has another ending, or is no file in an existing directory.
+    """
+    if path and endings and path.suffix.lower() not in endings:
+        raise ValueError(f"{flag} must end in {' or '.join(endings)}, got {path}")
+    if path and (path.is_dir() or not path.parent.is_dir()):
+        raise ValueError(f"{flag} {path}: not a file in an existing directory")
 
 
 def _refuse_flags_as_values(settings: dict[str, Any], argv: Sequence[str]) -> None:

@@ -2,14 +2,16 @@
 
 import itertools
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from sofnn_torch import SGA, SOFNN, QConfig, QLearning, SGAConfig, Task
+from sofnn_torch import SGA, SOFNN, Config, QConfig, QLearning, SGAConfig, Task
 from sofnn_torch.network.axes import Axis
 from sofnn_torch.rules import regions
+from sofnn_torch.rules.__main__ import Options, region_of
 
 AXES = Axis("x", "m", 0, 1), Axis("y", "m", 0, 1), Axis("heading", "rad", period=2 * math.pi)
 TASK = Task(AXES, ("right", "straight", "left"), discrete=True)
@@ -142,3 +144,14 @@ def test_what_is_no_region_is_one_line(low, high, message):
 def test_actions_that_are_inputs_of_the_rules_are_refused():
     with pytest.raises(ValueError, match="no input of the rules"):
         regions.actions_within(learner(QLearning, coding="antecedent"), [0, 0, 0], [1, 1, 1])
+
+
+def test_the_hint_for_ends_in_the_wrong_order_is_for_inputs_that_wrap():
+    def asked(*within):
+        options = Options(run=Path("run"), within=within)
+        with pytest.raises(ValueError, match="the lower end comes first") as error:
+            region_of(options, Config())
+        return str(error.value)
+
+    assert asked(0, 1, 0, 1, 170.0, -170.0).endswith("(through the seam: 170 190)")
+    assert asked(0.3, 0.1, 0, 1, 0, 1).endswith("the lower end comes first")

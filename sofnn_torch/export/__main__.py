@@ -23,7 +23,7 @@ from sofnn_torch.bounds import Settings
 from sofnn_torch.evaluate import load
 from sofnn_torch.export import c, fis, graph, policy
 from sofnn_torch.runs import checkpoint
-from sofnn_torch.terminal import command, plural
+from sofnn_torch.terminal import check_output, command, plural
 
 READERS: dict[str, Callable[[Path], dict[str, Any]]] = {
     ".json": policy.from_json,
@@ -65,10 +65,7 @@ def check(options: Options) -> None:
     if not options.to:
         raise ValueError("--to needs a file to write")
     for path in options.to:
-        if path.suffix.lower() not in WRITERS:
-            raise ValueError(f"--to must end in {' or '.join(WRITERS)}, got {path}")
-        if path.is_dir() or not path.parent.is_dir():
-            raise ValueError(f"--to {path}: not a file in an existing directory")
+        check_output("--to", path, tuple(WRITERS))
     if options.precision != "float" and not any(p.suffix.lower() == ".h" for p in options.to):
         raise ValueError("--precision is for a C header: give --to a file that ends in .h")
     if (options.run.suffix.lower() == ".fis") != bool(options.like):

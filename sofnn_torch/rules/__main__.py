@@ -43,7 +43,7 @@ from sofnn_torch.runs.factory import make_env, make_plan
 from sofnn_torch.runs.places import numbered
 from sofnn_torch.runs.session import RunOptions, arithmetic, home_of
 from sofnn_torch.runs.settings import MAZE, Config
-from sofnn_torch.terminal import command, plural, say
+from sofnn_torch.terminal import check_output, command, plural, say
 from sofnn_torch.training import play
 
 PICTURES = (".png", ".svg", ".pdf")
@@ -96,11 +96,7 @@ def check(options: Options) -> None:
     RunOptions(name=options.name)
     outputs = {name: getattr(options, name) for name in ("json", "csv", "picture")}
     for name, path in outputs.items():
-        endings = PICTURES if name == "picture" else (f".{name}",)
-        if path and path.suffix.lower() not in endings:
-            raise ValueError(f"--{name} must end in {' or '.join(endings)}, got {path}")
-        if path and (path.is_dir() or not path.parent.is_dir()):
-            raise ValueError(f"--{name} {path}: not a file in an existing directory")
+        check_output(f"--{name}", path, PICTURES if name == "picture" else (f".{name}",))
     given = [f"--{name}" for name in ("load", "at", "within", *outputs) if getattr(options, name)]
     if len(given) > 1 and (options.load or options.at or options.within):
         raise ValueError(f"{given[0]} and {given[1]} do not go together: use two commands")
@@ -246,7 +242,8 @@ def region_of(options: Options, config: Config) -> tuple[list[float], list[float
     low, high = ends[::2], ends[1::2]
     for axis, a, b in zip(axes, low, high, strict=True):
         if a > b:
-            hint = f" (through the seam: {a:g} {b + 360:g})" if config.env == MAZE else ""
+            turn = 360 if config.env == MAZE else axis.period
+            hint = f" (through the seam: {a:g} {b + turn:g})" if axis.period else ""
             raise ValueError(f"--within {axis.name} {a:g} {b:g}: the lower end comes first{hint}")
     if config.env == MAZE:
         low[2], high[2] = math.radians(low[2]), math.radians(high[2])
