@@ -13,8 +13,8 @@ from hypothesis import given
 from hypothesis import settings as trials_of
 from hypothesis import strategies as st
 
-from sofnn_torch.rules import __main__ as rules
-from sofnn_torch.rules import files
+from sofnn_torch.evaluate import Loaded
+from sofnn_torch.rules import editing, files
 
 STATE = np.float32([0.5, 0.5, 0.0])
 
@@ -250,15 +250,14 @@ def test_broken_files_load_whole_or_not_at_all(few, tmp_path, monkeypatch, suffi
     def create(*_):
         raise Accepted
 
-    monkeypatch.setattr(rules.Run, "create", create)
+    monkeypatch.setattr(editing.Run, "create", create)
 
     @trials_of(max_examples=300, deadline=None, database=None, suppress_health_check=SLOW)
     @given(broken(suffix, text))
     def attempt(data):
         rule_file.write_bytes(data)
-        options = rules.Options(run=path, load=rule_file)
         try:
-            rules.edit(options, rule_file, config, agent, file, state)
+            editing.edited(path, Loaded(config, agent, file, state), rule_file)
         except Accepted:
             outcomes["accepted"] += 1
             table = parameters(agent)

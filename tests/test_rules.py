@@ -18,7 +18,7 @@ from rich.console import Console
 from sofnn_torch import evaluate, training
 from sofnn_torch.network.sofnn import SOFNN
 from sofnn_torch.rules import __main__ as rules
-from sofnn_torch.rules import files, words
+from sofnn_torch.rules import files, tables, words
 from sofnn_torch.runs import checkpoint
 from sofnn_torch.runs.directory import load_config
 from sofnn_torch.runs.factory import make_agent
@@ -270,11 +270,11 @@ def printed(view, width=100):
 @pytest.mark.parametrize("width", [60, 70, 80, 200])
 def test_a_table_in_a_narrow_terminal_loses_nothing(width, monkeypatch):
     learner = small((0.5, 0.1, 0.65), (-0.25, 0.3, -0.001))
-    view = rules.table(words.read(learner), np.array([0.25, 0.75]), top=20)
+    view = tables.table(words.read(learner), np.array([0.25, 0.75]), top=20)
     whole = printed(view, 200)
     terminal = Console(width=width, file=io.StringIO(), force_terminal=True, color_system=None)
-    monkeypatch.setattr(rules, "Console", lambda: terminal)
-    rules.show(view)
+    monkeypatch.setattr(tables, "Console", lambda: terminal)
+    tables.show(view)
     text = terminal.file.getvalue()
     assert "…" not in text and max(map(len, text.splitlines())) <= width
     assert sorted(text.split()) == sorted(whole.split()) or width < 80
@@ -285,7 +285,7 @@ def test_a_table_in_a_narrow_terminal_loses_nothing(width, monkeypatch):
 def test_the_table_of_two_rules():
     learner = small((0.5, 0.1, 0.65), (-0.25, 0.3, -0.001))
     said = words.read(learner)
-    text = printed(rules.table(said, np.array([0.25, 0.75]), top=20))
+    text = printed(tables.table(said, np.array([0.25, 0.75]), top=20))
     *_, second, first = [line.split() for line in text.splitlines() if "±" in line]
     width = round(math.degrees(0.45))
     assert (
@@ -296,7 +296,7 @@ def test_the_table_of_two_rules():
         "IF x is about 150 ± 60 mm AND y is about 250 ± 60 mm AND heading is about 90 ± 26° N "
         "THEN left turn (mu 0.50, sigma 0.10, value 0.65)"
     )
-    assert len(printed(rules.table(said, np.array([0.25, 0.75]), top=1)).splitlines()) == 7
+    assert len(printed(tables.table(said, np.array([0.25, 0.75]), top=1)).splitlines()) == 7
 
 
 def test_a_rule_that_all_rules_together_overrule_is_marked():
@@ -308,13 +308,13 @@ def test_a_rule_that_all_rules_together_overrule_is_marked():
     said = words.read(learner)
     assert said.consequents[""] == ["left turn", "right turn", "straight"]
     assert said.outvoted.tolist() == [True, True, False]
-    assert printed(rules.table(said, np.ones(3), 0)).count("turn * ") == 2
-    text = rules.summary(np.array([0.5, 0.45, 0.05]), 10, said)
+    assert printed(tables.table(said, np.ones(3), 0)).count("turn * ") == 2
+    text = tables.summary(np.array([0.5, 0.45, 0.05]), 10, said)
     assert "3 rules: 1 make up 50 % of the firing along the trial, 2 make up 90 %, 0 took" in text
     assert "2 rules (*) are outvoted" in text
     one = replace(said, outvoted=np.array([True, False, False]))
-    assert "1 rule (*) is outvoted" in rules.summary(np.ones(3) / 3, 10, one)
-    assert "2 took no part" in rules.summary(np.array([0.9991, 0.0009, 0.0]), 10, said)
+    assert "1 rule (*) is outvoted" in tables.summary(np.ones(3) / 3, 10, one)
+    assert "2 took no part" in tables.summary(np.array([0.9991, 0.0009, 0.0]), 10, said)
 
 
 def test_the_values_of_q_learning():
@@ -367,7 +367,7 @@ def test_the_rules_at_a_state_add_up_to_what_the_learner_says(trained, variant):
         else:
             assert f"{action[-1]:.2f}".replace("-0.00", "0.00") in decision.action
             assert chosen is None or f"{chosen:.2f}" in decision.action
-        text = printed(rules.decision_table(said, decision, variant == "q-antecedent"))
+        text = printed(tables.decision_table(said, decision, variant == "q-antecedent"))
         shown = [line.split() for line in text.splitlines() if "±" in line]
         total = sum(float(words[1].rstrip("%")) for words in shown)
         assert 98.5 < total < 100.5
