@@ -20,10 +20,10 @@ if __name__ == "__main__":  # Ctrl-C while libraries load: there is nothing to s
 
 from sofnn_torch import training
 from sofnn_torch.bounds import Count, Settings
-from sofnn_torch.runs import checkpoint, directory, parallel
+from sofnn_torch.runs import checkpoint, directory, parallel, preset_files
 from sofnn_torch.runs.guard import Divergence
 from sofnn_torch.runs.session import RunOptions, home_of, saved_config
-from sofnn_torch.runs.settings import Config
+from sofnn_torch.runs.settings import BASIC, Config
 from sofnn_torch.terminal import attempt, plural, program, quoted
 from sofnn_torch.terminal import parse as parse_flags
 
@@ -33,12 +33,11 @@ Examples:
   train.py                                     stochastic gradient ascent, growing network
   train.py --agent q --network fixed --pose true --seed 3 --trials 300
   train.py --resume runs/sga-sofnn-estimated-s0  go on where a run stopped
+  train.py --settings best.toml --trials 300   settings from a file, one of them changed
   train.py --seeds 0-7 --workers 2             eight runs, two at a time
 
 Ctrl-C saves. Watch with: tensorboard --logdir runs
 """
-
-BASIC = ("env", "agent", "network", "preset", "seed")  # all other settings depend on them
 
 
 @dataclass(frozen=True)
@@ -47,6 +46,8 @@ class Flags(Settings):
 
     config: Annotated[Config, tyro.conf.arg(name="")]
     options: Annotated[RunOptions, tyro.conf.arg(name="")]
+    settings: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Start from the settings in this TOML file; the other flags change them."""
     resume: Annotated[Path | None, tyro.conf.arg(metavar="RUN")] = None
     """Go on with the run in this directory, or from one of its checkpoint files. Its settings
     are kept; only `--trials` may be raised."""
@@ -115,7 +116,8 @@ def parse(argv: Sequence[str]) -> Flags:
     """
     first = _Parser(add_help=False, allow_abbrev=False)
     for name in BASIC:
-        first.add_argument(f"--{name}", default=getattr(Config, name))
+        first.add_argument(f"--{name}", default=argparse.SUPPRESS)
+    first.add_argument("--settings", type=Path)
     first.add_argument("--resume", type=Path)
     known, _ = first.parse_known_args(argv)
     if known.resume and not {"-h", "--help"} & set(argv):
@@ -138,20 +140,24 @@ class _Parser(argparse.ArgumentParser):
 
 
 def _preset(known: argparse.Namespace) -> Config:
+    """The settings that the flags change: of a preset of the package, or of one in a file."""
+    given = {name: value for name, value in vars(known).items() if name in BASIC}
+    seed = str(given.pop("seed", ""))
+    given |= {"seed": int(seed)} if seed.isdecimal() else {}
+    if known.settings:
+        return preset_files.from_file(known.settings, **given)
     try:
-        given = {name: getattr(known, name) for name in BASIC}
-        seed = str(known.seed)
-        return Config(**given | {"seed": int(seed) if seed.isdecimal() else 0})
+        return Config(**given)
     except ValueError:
-        if known.env != Config.env:  # the flags below are those of another task
+        if given.get("env", Config.env) != Config.env:  # the flags below are those of another task
             raise
         return Config()  # no such preset: all flags are checked next
 
 
 def _keep_settings(flags: Flags, run: Path, base: Config) -> None:
     """Refuse flags that contradict the run to resume."""
-    if flags.seeds is not None or flags.again:
-        raise ValueError("--resume goes with neither --seeds nor --again")
+    if flags.seeds is not None or flags.again or flags.settings:
+        raise ValueError("--resume goes with neither --seeds, --again nor --settings")
     moved = {"name", "runs"} & set(_changes(flags.options, RunOptions()))
     if moved and home_of(run):
         raise ValueError(f"--{min(moved)} is for new runs; a resumed run keeps its directory")

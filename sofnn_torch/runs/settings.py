@@ -11,6 +11,7 @@ import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -31,6 +32,7 @@ from sofnn_torch.tasks.survey import survey
 
 PRESET: Any = None  # as a default: the value of the preset
 MAZE = "maze"
+BASIC = ("env", "agent", "network", "preset", "seed")  # the preset of all others depends on them
 Input = tuple[str, str, float, float, float]
 
 
@@ -87,6 +89,17 @@ class Config(Settings):
                 object.__setattr__(self, name, value)
         super().__post_init__()
         self._check_together()
+
+    @classmethod
+    def from_file(cls, path: Path | str, **changes: Any) -> "Config":
+        """The settings in a file for ``train.py --settings`` (`sofnn_torch.runs.preset_files`).
+
+        Raises:
+            ValueError: one line on what is wrong in it.
+        """
+        from sofnn_torch.runs import preset_files  # which needs this class
+
+        return preset_files.from_file(path, **changes)
 
     @property
     def learner(self) -> type[Learner]:

@@ -8,10 +8,12 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+from sofnn_torch.runs import preset_files
 from sofnn_torch.runs.directory import flatten
 from sofnn_torch.runs.settings import Config, from_dict
 
 Arm = dict[str, Any]
+CHOICE = ("agent", "network", "preset")  # entries that choose a preset
 
 
 class Times(NamedTuple):
@@ -210,39 +212,19 @@ def settings(arm: Arm, seed: int = 0, **changes: Any) -> Config:
     Raises:
         ValueError: an entry that is no setting, or a value out of range.
     """
-    arm = arm | changes
-    agent, network = arm.pop("agent"), arm.pop("network", "sofnn")
-    config = Config(agent=agent, network=network, preset=arm.pop("preset", "default"))
-    tables: dict[str, Arm] = {}
+    arm = {"seed": seed} | arm | changes
+    base = Config(**{name: arm[name] for name in CHOICE if name in arm})
+    before = flatten(dataclasses.asdict(base))
     for name, value in arm.items():
-        table, _, entry = name.rpartition(".")
-        before = getattr(config, table, None) if table else config
-        if not dataclasses.is_dataclass(before) or not hasattr(before, entry):
-            raise ValueError(f"{name!r} is not a setting")
         if isinstance(value, Times):
-            value = value.factor * getattr(before, entry)
-        tables.setdefault(table, {})[entry] = value
-    top: Arm = {"seed": seed} | tables.pop("", {})
-    parts = {name: dataclasses.replace(getattr(config, name), **t) for name, t in tables.items()}
-    return dataclasses.replace(config, **top, **parts)
+            arm[name] = value.factor * before[name]
+    return preset_files.make(arm)
 
 
 def changed(arm: Arm) -> str:
     """What an arm changes against the preset that it starts from, as flags of ``train.py``."""
-    base: Arm = {k: arm[k] for k in ("agent", "network", "preset") if k in arm}
-    before = flatten(dataclasses.asdict(settings(base)))
-    after = flatten(dataclasses.asdict(settings(arm)))
-    words = []
-    for name, value in after.items():
-        if value != before[name]:
-            if isinstance(value, bool):
-                table, dot, entry = name.rpartition(".")
-                words.append(f"--{table}{dot}{'' if value else 'no-'}{entry}".replace("_", "-"))
-                continue
-            text = f"{value:.12g}" if isinstance(value, float) else str(value)
-            text = " ".join(map(str, value)) if isinstance(value, list) else text
-            words.append(f"--{name} {text}".replace("_", "-"))
-    return " ".join(words)
+    given = preset_files.differences(settings(arm))
+    return preset_files.flags({k: v for k, v in given.items() if k not in CHOICE})
 
 
 def essence(config: Config) -> Config:
