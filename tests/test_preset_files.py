@@ -127,7 +127,12 @@ def test_written_settings_are_read_again_from_the_file_and_from_the_flags(config
 
 
 @settings(max_examples=50, deadline=None)
-@given(st.text() | st.none() | st.floats(allow_nan=False) | st.lists(st.integers(0, 9)))
+@given(
+    st.text()
+    | st.none()
+    | st.floats(allow_nan=False, allow_infinity=False)
+    | st.lists(st.integers(0, 9))
+)
 def test_a_value_survives_toml(value):
     text = f"x = {preset_files._toml(value)}"
     assert tomllib.loads(text)["x"] == ("None" if value is None else value)
