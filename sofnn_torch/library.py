@@ -65,7 +65,7 @@ class Agent:
         trials: that were learned from.
         total_steps: of these.
 
-    Example:
+    Examples:
         >>> import gymnasium
         >>> from sofnn_torch import SGA
         >>> env = gymnasium.make("Pendulum-v1")
@@ -110,7 +110,7 @@ class Agent:
             Divergence: numbers diverged; train anew with smaller step sizes.
             OSError: the curves cannot be written.
 
-        Example:
+        Examples:
             >>> from sofnn_torch import QLearning
             >>> agent = QLearning.for_env("CartPole-v1", seed=0)
             >>> records = agent.learn("CartPole-v1", trials=5, quiet=True)
@@ -161,7 +161,7 @@ class Agent:
         Raises:
             ValueError: as `learn`, or nothing was learned yet.
 
-        Example:
+        Examples:
             >>> from sofnn_torch import SGA
             >>> agent = SGA.for_env("CartPole-v1")
             >>> _ = agent.learn("CartPole-v1", trials=2, quiet=True)
@@ -183,7 +183,7 @@ class Agent:
     def start(self, observation: Any) -> Any:
         """Begin a trial at an observation: the first action.
 
-        Example:
+        Examples:
             >>> import gymnasium
             >>> from sofnn_torch import QLearning
             >>> env = gymnasium.make("CartPole-v1")
@@ -231,7 +231,7 @@ class Agent:
             ValueError: the observation has another shape or is not finite, or nothing was
                 learned yet.
 
-        Example:
+        Examples:
             >>> import numpy as np
             >>> from sofnn_torch import QLearning
             >>> agent = QLearning.for_env("CartPole-v1")
@@ -265,7 +265,7 @@ class Agent:
         Raises:
             OSError: it cannot be written; an older file of the name is as it was.
 
-        Example:
+        Examples:
             >>> import tempfile
             >>> from sofnn_torch import SGA, Agent
             >>> agent = SGA.for_env("CartPole-v1")

@@ -11,14 +11,13 @@ from pathlib import Path
 import gymnasium
 import pytest
 
-from sofnn_torch import bounds, learners, library, network
-from sofnn_torch.runs import settings
+import sofnn_torch
 
 ROOT = Path(__file__).parents[1]
-MODULES = [bounds, library, settings] + [
+MODULES = [
     importlib.import_module(found.name)
-    for room in (network, learners)
-    for found in pkgutil.iter_modules(room.__path__, f"{room.__name__}.")
+    for found in pkgutil.walk_packages(sofnn_torch.__path__, "sofnn_torch.")
+    if not found.name.endswith("__main__")
 ]
 EXAMPLES = [
     pytest.param(test, id=test.name)
@@ -33,9 +32,25 @@ def test_what_a_docstring_shows_is_so(example):
     assert doctest.DocTestRunner().run(example).failed == 0
 
 
-def test_the_public_classes_show_how_they_are_used():
-    shown = {example.id.rpartition(".")[2] for example in EXAMPLES}
-    assert shown >= {"SOFNN", "Axis", "SGA", "QLearning", "Config", "bounds"}
+def shown_names():
+    """What the package offers, and what the pages of the reference show."""
+    pages = [page.read_text() for page in (ROOT / "docs" / "reference").glob("*.md")]
+    return {f"sofnn_torch.{name}" for name in sofnn_torch.__all__} | {
+        name for page in pages for name in re.findall(r"^::: (\S+)$", page, re.MULTILINE)
+    }
+
+
+def test_every_class_that_is_offered_shows_how_it_is_used():
+    offered = [pkgutil.resolve_name(name) for name in shown_names()]
+    classes = [thing for thing in offered if isinstance(thing, type)]
+    assert len(classes) > 20
+    shown = {example.id for example in EXAMPLES}
+    assert [c for c in classes if f"{c.__module__}.{c.__qualname__}" not in shown] == []
+
+
+def test_the_reference_shows_all_that_the_package_offers():
+    pages = "".join(page.read_text() for page in (ROOT / "docs" / "reference").glob("*.md"))
+    assert [n for n in sofnn_torch.__all__ if f"::: sofnn_torch.{n}\n" not in pages] == []
 
 
 def test_a_function_is_fitted_while_the_network_grows(capsys):

@@ -49,7 +49,7 @@ class Policy:
     Raises:
         ValueError: one line on what is wrong with the data.
 
-    Example:
+    Examples:
         >>> rule = {"centre": [0.5], "width": [0.1], "consequents": [-0.4, 0.1]}
         >>> decision = {"kind": "normal", "numbers": 1, "edges": [0.0]}
         >>> axis = {"name": "x", "unit": "", "low": 0, "high": 1, "period": 0}

@@ -24,6 +24,15 @@ class FrozenPolicy:
     Args:
         agent: the learner; only its random generator moves.
         explore: begin with the learned stochastic policy instead of the mean or greedy action.
+
+    Examples:
+        >>> import gymnasium
+        >>> from sofnn_torch import SGA
+        >>> agent = SGA.for_env("Pendulum-v1", seed=0)
+        >>> observation, _ = gymnasium.make("Pendulum-v1").reset(seed=0)
+        >>> _ = agent.start(observation)
+        >>> FrozenPolicy(agent.learner).act(observation).shape
+        (1,)
     """
 
     def __init__(self, agent: Learner, explore: bool = False):

@@ -44,6 +44,11 @@ class Task:
         reward_scale: factor of each reward before it is learned from; values are in its unit.
         patience: decisions at one rule after which a policy that does not learn is taken to run in
             a circle; inf for never.
+
+    Examples:
+        >>> from sofnn_torch.network.axes import Axis
+        >>> Task((Axis("speed", "m/s", 0, 2),), ("brake", "drive"), discrete=True).patience
+        4
     """
 
     axes: tuple[Axis, ...]
@@ -64,6 +69,10 @@ class Output:
         low: the least value that learning leaves it.
         high: the greatest.
         interpolates: a network that interpolates gives a new rule its present output instead.
+
+    Examples:
+        >>> Output("sigma", initial=0.3, low=0.1, high=1.0).name
+        'sigma'
     """
 
     name: str
@@ -81,6 +90,16 @@ class Plan:
         actions: as `Learner.act` gives them: numbers of the actions (B,), or vectors (B, m).
         choice: number of the action among `Learner.choices`; None without choices. Shape: (B,).
         value: what the learner expects from there; None if it keeps no value. Shape: (B,).
+
+    Examples:
+        >>> import torch
+        >>> from sofnn_torch import SGA, SGAConfig, SOFNN
+        >>> task = Task((Axis("angle"),), ("push",), discrete=False)
+        >>> net = SOFNN(1, 3, width=0.2, initial=[0.0, 0.3, 0.65])
+        >>> agent = SGA(net, task, SGAConfig())
+        >>> _ = agent.start(np.zeros(1))
+        >>> agent.plan(np.zeros((5, 1))).actions.shape
+        (5, 1)
     """
 
     actions: NDArray[Any]
@@ -116,6 +135,13 @@ class Learner(ABC):
 
     Raises:
         ValueError: the network has other inputs or outputs than the layout.
+
+    Examples:
+        >>> from sofnn_torch import SGA
+        >>> learner = SGA.for_env("Pendulum-v1", seed=0).learner
+        >>> action = learner.start(np.array([1.0, 0.0, 0.0]))
+        >>> learner.step(-0.1, np.array([0.9, 0.4, 1.0]), terminated=False).shape
+        (1,)
     """
 
     name: ClassVar[str]
@@ -153,7 +179,7 @@ class Learner(ABC):
         Raises:
             ValueError: spaces or settings that are not supported.
 
-        Example:
+        Examples:
             >>> from sofnn_torch import QLearning
             >>> agent = QLearning.for_env("CartPole-v1", seed=0, temperature=0.01)
             >>> agent.learner.task.actions

@@ -18,6 +18,12 @@ class ReplayMemory:
             ``{"state": 3, "reward": 0}``.
         capacity: decisions that are kept; a new one then takes the place of the oldest.
         dtype: of the numbers.
+
+    Examples:
+        >>> memory = ReplayMemory({"state": 3, "reward": 0}, capacity=100)
+        >>> memory.add([0.1, 0.2, 0.3, 1.0])
+        >>> memory.sample(2, np.random.default_rng(0), torch.zeros(1))["state"].shape
+        torch.Size([2, 64, 3])
     """
 
     def __init__(self, fields: dict[str, int], capacity: int, dtype: DTypeLike = np.float32):

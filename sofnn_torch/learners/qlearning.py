@@ -34,7 +34,12 @@ ACTION = Axis("action", "", -1.0, 1.0)
 
 @dataclass(frozen=True)
 class QConfig(Settings, table="q"):
-    """Section 4: Q-learning."""
+    """Section 4: Q-learning.
+
+    Examples:
+        >>> QConfig(temperature=0.1).value_limit
+        100.0
+    """
 
     coding: Literal["scalar", "wheels", "onehot", "antecedent"] = "onehot"
     """Action vector of eq. 9: `scalar`, `wheels` (wheel speeds), `onehot`, or `antecedent` (the
@@ -90,7 +95,7 @@ class QLearning(Learner):
         ValueError: the network has another number of inputs or outputs, or the settings do not go
             with the task.
 
-    Example:
+    Examples:
         >>> from sofnn_torch.network.axes import named
         >>> task = Task(named(2), ("left", "right"), discrete=True)
         >>> agent = QLearning(SOFNN(2, 5, width=0.2), task, QConfig())

@@ -35,7 +35,12 @@ PolicyRate = Annotated[NotNegative, Within(most=500)]
 
 @dataclass(frozen=True)
 class SGAConfig(Settings, table="sga"):
-    """Section 3: stochastic gradient ascent."""
+    """Section 3: stochastic gradient ascent.
+
+    Examples:
+        >>> SGAConfig(replays=0).idle()
+        {'constant': 'with --sga.baseline value', 'memory': 'with --sga.replays 0'}
+    """
 
     gamma: Share = 0.99
     """Discount per decision."""
@@ -117,7 +122,7 @@ class SGA(Learner):
     Raises:
         ValueError: the network has another number of inputs or outputs.
 
-    Example:
+    Examples:
         >>> from sofnn_torch.network.axes import named
         >>> task = Task(named(2), ("left", "right"), discrete=True)
         >>> agent = SGA(SOFNN(2, 3, width=0.2, initial=[0.0, 0.3, 0.65]), task, SGAConfig())

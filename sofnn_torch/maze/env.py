@@ -56,6 +56,14 @@ class KheperaMazeEnv(gymnasium.Env[np.ndarray, Any]):
     Rewards add up over a decision: `goal_reward` at the goal, where the trial ends,
     `collision_reward` for a bump, `subgoal_reward` for each sub-goal, once a trial, and
     `step_reward` for the decision itself.
+
+    Examples:
+        >>> import gymnasium
+        >>> env = gymnasium.make("sofnn_torch:KheperaMaze-v0", pose="true", layout="rooms")
+        >>> observation, _ = env.reset(seed=0)
+        >>> observation, reward, terminated, truncated, info = env.step(1)  # straight on
+        >>> terminated, info["steps"]
+        (False, 10)
     """
 
     metadata = {"render_modes": ["rgb_array", "human"], "render_fps": 10}  # noqa: RUF012

@@ -30,7 +30,14 @@ def heading_of(w: float, x: float, y: float, z: float) -> float:
 
 @dataclass(frozen=True)
 class MazePlan:
-    """Walls and zones of a maze, in metres."""
+    """Walls and zones of a maze, in metres.
+
+    Examples:
+        >>> from sofnn_torch.runs.factory import make_plan
+        >>> from sofnn_torch.runs.settings import Config
+        >>> make_plan(Config()).size
+        (1.0, 1.0)
+    """
 
     size: Place
     walls: list[Box]  # x0, y0, x1, y1, outer walls included

@@ -24,7 +24,12 @@ GOAL = Axis("goal x", "m", 0.0, 1.0), Axis("goal y", "m", 0.0, 1.0)
 
 @dataclass(frozen=True)
 class MazeConfig(Settings, table="maze"):
-    """Section 5: robot and maze."""
+    """Section 5: robot and maze.
+
+    Examples:
+        >>> MazeConfig(layout="rooms", motor_noise=0).hold
+        10
+    """
 
     layout: str = STANDARD
     """Maze: a file with a map or an MJCF, of which the content is kept with the run, or one that is

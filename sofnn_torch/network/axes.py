@@ -19,7 +19,7 @@ class Axis:
     Raises:
         ValueError: the range is empty, or the period is negative or not finite.
 
-    Example:
+    Examples:
         >>> Axis("heading", "rad", -math.pi, math.pi, period=2 * math.pi).bounded
         True
     """

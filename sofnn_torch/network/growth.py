@@ -40,6 +40,16 @@ class Criterion(ABC):
 
     Raises:
         ValueError: theta is out of range.
+
+    Examples:
+        A rule wherever the present ones are not at home, but never more than a hundred:
+
+        >>> class Frugal(Rule):
+        ...     def place(self, net, x, squares, log_firing, best):
+        ...         full = net.n_rules >= 100
+        ...         return None if full else super().place(net, x, squares, log_firing, best)
+        >>> from sofnn_torch import SOFNN
+        >>> net = SOFNN(1, 1, width=0.1, growth=Frugal(0.5))
     """
 
     grows = True
@@ -75,7 +85,16 @@ class Criterion(ABC):
 
 
 class Rule(Criterion):
-    """A rule is added at x when no rule's firing strength reaches theta."""
+    """A rule is added at x when no rule's firing strength reaches theta.
+
+    Examples:
+        >>> from sofnn_torch import SOFNN
+        >>> net = SOFNN(2, 1, width=0.1, growth="rule")
+        >>> states = torch.tensor([[0.0, 0.0], [0.3, 0.0], [0.0, 0.3], [0.3, 0.3]])
+        >>> grown = [net.grow(state) for state in states]
+        >>> net.n_rules
+        4
+    """
 
     def place(  # noqa: D102
         self, net: "SOFNN", x: Tensor, squares: Tensor, log_firing: Tensor, best: float
@@ -84,7 +103,16 @@ class Rule(Criterion):
 
 
 class Literal(Criterion):
-    """A rule is added at x when no membership of any input reaches theta."""
+    """A rule is added at x when no membership of any input reaches theta.
+
+    Examples:
+        >>> from sofnn_torch import SOFNN
+        >>> net = SOFNN(2, 1, width=0.1, growth="literal")
+        >>> states = torch.tensor([[0.0, 0.0], [0.3, 0.0], [0.0, 0.3], [0.3, 0.3]])
+        >>> grown = [net.grow(state) for state in states]
+        >>> net.n_rules
+        2
+    """
 
     def place(  # noqa: D102
         self, net: "SOFNN", x: Tensor, squares: Tensor, log_firing: Tensor, best: float
@@ -97,6 +125,14 @@ class Input(Criterion):
 
     An input whose memberships all stay under theta gets a new membership function, and each newly
     met combination of best membership functions becomes a rule.
+
+    Examples:
+        >>> from sofnn_torch import SOFNN
+        >>> net = SOFNN(2, 1, width=0.1, growth="input")
+        >>> states = torch.tensor([[0.0, 0.0], [0.3, 0.0], [0.0, 0.3], [0.3, 0.3]])
+        >>> grown = [net.grow(state) for state in states]
+        >>> net.n_rules
+        4
     """
 
     shared = True
@@ -116,7 +152,16 @@ class Input(Criterion):
 
 
 class Frozen(Criterion):
-    """The structure never changes (FSFNN)."""
+    """The structure never changes (FSFNN).
+
+    Examples:
+        >>> from sofnn_torch import SOFNN
+        >>> net = SOFNN(2, 1, width=0.1, growth="frozen")
+        >>> states = torch.tensor([[0.0, 0.0], [0.3, 0.0], [0.0, 0.3], [0.3, 0.3]])
+        >>> grown = [net.grow(state) for state in states]
+        >>> net.n_rules
+        0
+    """
 
     grows = False
 

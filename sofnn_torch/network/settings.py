@@ -15,7 +15,12 @@ Rules = Annotated[int, Within(above=0)]
 
 @dataclass(frozen=True)
 class NetworkConfig(Settings, table="net"):
-    """Section 2: the fuzzy network."""
+    """Section 2: the fuzzy network.
+
+    Examples:
+        >>> NetworkConfig(grid=(4,)).along(inputs=3)
+        (4, 4, 4)
+    """
 
     theta: Annotated[float, Within(above=0, below=1)] = 0.4
     """Growth threshold theta_th of eq. 3: a rule is added where firing stays below it."""

@@ -52,7 +52,7 @@ class SOFNN(RuleTable):
     Raises:
         ValueError: a setting is out of range; the message says which and what to do.
 
-    Example:
+    Examples:
         >>> net = SOFNN(2, 1, width=0.2)
         >>> [net.grow(torch.tensor(x)) for x in ([0.1, 0.1], [0.1, 0.2], [0.9, 0.9])]
         [True, False, True]
@@ -348,6 +348,11 @@ def grid(axes: Sequence[Axis], shape: Sequence[int], n_outputs: int, **settings:
 
     Raises:
         ValueError: lengths differ, an axis has no ends or a count is not positive.
+
+    Examples:
+        >>> pose = Axis("x", "m", 0, 1), Axis("y", "m", 0, 1)
+        >>> grid(pose, (12, 12), n_outputs=3).n_rules
+        144
     """
     if len(axes) != len(shape) or any(s < 1 for s in shape):
         raise ValueError(f"a grid over {len(axes)} axes needs as many positive counts, got {shape}")

@@ -30,7 +30,12 @@ WINDOW = 10  # trials that decide which checkpoint is the best
 
 @dataclass(frozen=True)
 class RunOptions(Settings):
-    """How a run is kept and shown; nothing here but `threads` and `portable` changes bits."""
+    """How a run is kept and shown; nothing here but `threads` and `portable` changes bits.
+
+    Examples:
+        >>> RunOptions(runs="experiments", name="first", picture_every=0).name
+        'first'
+    """
 
     runs: Path = Path("runs")
     """Directory of all runs."""

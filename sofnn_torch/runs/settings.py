@@ -43,7 +43,7 @@ class Config(Settings):
     Without flags: stochastic gradient ascent on a growing network. Watch with
     ``tensorboard --logdir runs``.
 
-    Example:
+    Examples:
         >>> Config(agent="q").maze.goal_reward
         100.0
     """

@@ -11,7 +11,12 @@ from sofnn_torch.learners.learner import Learner
 
 @dataclass(frozen=True)
 class TrialRecord:
-    """What one trial was like; a line of ``trials.csv``. Nothing in it depends on the clock."""
+    """What one trial was like; a line of ``trials.csv``. Nothing in it depends on the clock.
+
+    Examples:
+        >>> TrialRecord(1, 512, 60, 512, 0.9, True, 300).outcome
+        True
+    """
 
     trial: int
     """Number of the trial, from 1."""
@@ -58,6 +63,11 @@ class Trajectory:
         true: where it was. Shape: (T, n).
         estimated: where the learner believed to be. Shape: (T, n).
         goal: where the goal of the trial was, if the learner was told. Shape: (0,) or (2,).
+
+    Examples:
+        >>> poses = np.zeros((5, 3))
+        >>> Trajectory(true=poses, estimated=poses + 0.01).decided_at("estimated").shape
+        (4, 3)
     """
 
     true: NDArray[Any]

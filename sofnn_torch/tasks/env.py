@@ -93,7 +93,7 @@ class TaskEnv(gymnasium.Env[NDArray[np.float32], Any]):
     Raises:
         ValueError: the observation or the action is of a kind that is not supported.
 
-    Example:
+    Examples:
         >>> env = TaskEnv(gymnasium.make("Pendulum-v1"))
         >>> env.action_space, [axis.name for axis in env.axes][2]
         (Box(-1.0, 1.0, (1,), float32), 'angular velocity')
