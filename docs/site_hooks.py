@@ -16,7 +16,7 @@ from mkdocs.structure.files import File, Files
 ROOT = Path(__file__).parents[1]
 BESIDE = {name: name.lower() for name in ("CONTRIBUTING.md", "CODE_OF_CONDUCT.md", "CHANGELOG.md")}
 LINK = re.compile(r"(?<=\]\()[^)\s]+(?=\))")
-FORMULA = re.compile(r'<span class="arithmatex">\\\((.*?)\\\)</span>', re.DOTALL)
+FORMULA = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', re.DOTALL)
 
 
 def on_files(files: Files, config: Any) -> None:
@@ -50,5 +50,10 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str
 
 
 def on_page_content(content: str, **_: Any) -> str:
-    """Draw the formulas."""
-    return FORMULA.sub(lambda found: convert(html.unescape(found[1])), content)
+    """Draw the formulas, in the line or as a block."""
+
+    def drawn(found: re.Match[str]) -> str:
+        shape = {"span": "inline", "div": "block"}[found[1]]
+        return convert(html.unescape(found[2]), display=shape)
+
+    return FORMULA.sub(drawn, content)
