@@ -112,15 +112,12 @@ def test_the_version_is_the_same_everywhere():
     assert f"## {sofnn_torch.__version__}" in (ROOT / "CHANGELOG.md").read_text()
 
 
-def test_the_examples_and_links_of_the_readme_work():
+def test_the_examples_of_the_readme_work():
     text = (ROOT / "README.md").read_text()
     examples = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
     assert len(examples) == 2
     for example in examples:
         exec(example, {})
-    links = re.findall(r"\]\(([^)#:]+)\)", text)
-    assert len(links) > 8
-    assert [link for link in links if not (ROOT / link).exists()] == []
 
 
 def python(code, **environment):
