@@ -1,4 +1,4 @@
-"""Train a robot to find its way: `python train.py`; `python train.py --help` shows all flags."""
+"""Train a robot to find its way: `python train.py`; `--help` and `--help-all` show the flags."""
 
 import signal
 import sys

@@ -59,6 +59,9 @@ class Flags(Settings):
     """Play the trial again that follows a saved state, such as a `divergence-12.pt`."""
 
 
+MOST_USED = (  # what --help shows
+    "env agent network pose preset seed trials maze.layout settings resume seeds workers name quiet"
+).split()
 FAILURES = {ValueError: 2, Divergence: 1, OSError: 1}
 
 
@@ -120,12 +123,12 @@ def parse(argv: Sequence[str]) -> Flags:
     first.add_argument("--settings", type=Path)
     first.add_argument("--resume", type=Path)
     known, _ = first.parse_known_args(argv)
-    if known.resume and not {"-h", "--help"} & set(argv):
+    if known.resume and not {"-h", "--help", "--help-all"} & set(argv):
         base = saved_config(known.resume)
     else:
         base = _preset(known)
     unchanged = Flags(config=base, options=RunOptions())
-    flags = parse_flags(Flags, argv, EXAMPLES, unchanged)
+    flags = parse_flags(Flags, argv, EXAMPLES, unchanged, MOST_USED)
     if flags.resume:
         _keep_settings(flags, flags.resume, base)
     _refuse_idle(flags, unchanged)

@@ -8,14 +8,14 @@ import shlex
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import tyro
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
-from sofnn_torch import numerals
+from sofnn_torch import help, numerals
 from sofnn_torch.progress import say
 from sofnn_torch.runs.signals import Interrupted
 from sofnn_torch.streams import output
@@ -59,7 +59,13 @@ def _plain_number(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | No
     )
 
 
-def parse(kind: Any, argv: Sequence[str], description: str, default: Any = None) -> Any:
+def parse(
+    kind: Any,
+    argv: Sequence[str],
+    description: str,
+    default: Any = None,
+    first: Collection[str] = (),
+) -> Any:
     """Settings of a class from command line arguments; the framed messages of tyro made one line.
 
     Args:
@@ -67,11 +73,17 @@ def parse(kind: Any, argv: Sequence[str], description: str, default: Any = None)
         argv: the arguments.
         description: shown above the flags in the help.
         default: an instance whose values the flags change.
+        first: the flags that --help shows, if --help-all is to show the others.
 
     Raises:
         ValueError: one line on what is wrong.
         SystemExit: with code 0 after printing the help.
     """
+    asked = {"-h", "--help", *(["--help-all"] if first else [])} & set(argv)
+    if asked:
+        whole = not first or "--help-all" in asked
+        print(help.text(kind, program(), description, default, first, whole))
+        raise SystemExit(0)
     messages = io.StringIO()
     settings = {} if default is None else {"default": default}
     try:
@@ -82,7 +94,8 @@ def parse(kind: Any, argv: Sequence[str], description: str, default: Any = None)
     except SystemExit as stop:
         if not stop.code:
             raise
-    raise ValueError(f"{_first_message(messages.getvalue())} (--help lists all flags)")
+    flags = "--help-all" if first else "--help"
+    raise ValueError(f"{_first_message(messages.getvalue())} ({flags} lists all flags)")
 
 
 def command(action: Callable[[Any], Any], kind: Any, description: str, advice: str = "") -> None:

@@ -63,10 +63,10 @@ def bad(arguments, capsys):
 
 def test_the_help_begins_with_examples_and_shows_every_setting(capsys):
     with pytest.raises(SystemExit) as stop:
-        parse(["--help"])
+        parse(["--help-all"])
     assert stop.value.code == 0
     text = capsys.readouterr().out
-    assert text.index("train.py --resume") < text.index("--agent STR")
+    assert text.index("train.py --resume") < text.index("--agent TEXT")
     names = [name for name, part in asdict(Config()).items() if not isinstance(part, dict)]
     nested = asdict(Config()).items()
     names += [
@@ -78,7 +78,7 @@ def test_the_help_begins_with_examples_and_shows_every_setting(capsys):
 
 def test_the_help_shows_the_values_of_the_chosen_preset(capsys):
     with pytest.raises(SystemExit):
-        parse(["--preset", "paper", "--agent", "q", "--help"])
+        parse(["--preset", "paper", "--agent", "q", "--help-all"])
     text = re.sub(r"[│\s]+", " ", capsys.readouterr().out)
     rate = Config(agent="q", network="sofnn", preset="paper").q.trace_decay
     assert f"Lambda of the eligibility traces; 0 in the paper. (default: {rate})" in text
