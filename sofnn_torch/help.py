@@ -52,7 +52,7 @@ def text(
         whole: all flags, in groups; otherwise the first.
     """
     width = min(max(shutil.get_terminal_size().columns, NARROWEST), WIDEST)
-    flags = list(_flags(kind, default))
+    flags = sorted(_flags(kind, default), key=lambda flag: flag.group != "")
     arguments = " ".join(flag.usage for flag in flags if flag.positional)
     lines = [f"usage: {call} [OPTIONS] {arguments}".rstrip(), ""]
     for line in description.strip().splitlines():
