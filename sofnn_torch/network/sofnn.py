@@ -287,7 +287,8 @@ class SOFNN(RuleTable):
         if self.n_rules >= self.max_rules:
             self.refused += 1
             return False
-        width = self.default_width if width is None else width
+        buffers: dict[str, Any] = self._buffers  # quicker than by attribute
+        width = buffers["default_width"] if width is None else width
         if consequents is None:
             consequents = self._first_consequents(centre, log_firing)
         self._append((centre, width, consequents), labels)
@@ -296,7 +297,8 @@ class SOFNN(RuleTable):
     def _first_consequents(self, centre: Tensor, log_firing: Tensor | None) -> Tensor:
         """The configured consequents, or where so configured the present output. Shape: (m,)."""
         if self.n_rules == 0 or not self.interpolates:
-            return self.initial
+            buffers: dict[str, Any] = self._buffers
+            return buffers["initial"]
         if log_firing is None:
             firing = self.normalised_firing(centre, (self._centres, self._widths))
         else:

@@ -87,11 +87,14 @@ class RuleTable(RuleStore):
                 f"a rule has {self.n_inputs} centres, {self.n_inputs} widths and "
                 f"{self.n_outputs} consequents, got the shapes {[tuple(p.shape) for p in parts]}"
             )
-        column = torch.cat(parts).detach()
+        column = torch.cat(parts)
+        if column.requires_grad:
+            column = column.detach()
         k, n, numbers = self.n_rules, self.n_inputs, column.tolist()
         if not (math.isfinite(sum(map(abs, numbers))) and min(numbers[n : 2 * n]) > 0):
             raise ValueError(f"a rule needs finite numbers and positive widths: {numbers}")
-        self._check_alone()
+        if self._is_shared:
+            self._check_alone()
         if k == self.capacity:
             self._shape_blocks(self._sizes_for(k + 1))
         if self._followers:
