@@ -5,9 +5,9 @@
     python -m sofnn_torch.evaluate RUN --video run.mp4 --viewer
 
 By default the robot takes the mean action (SGA) or the greedy one (Q-learning); with --explore it
-samples its learned stochastic policy. After the fourth decision at the same rule in a trial the
-policy gains chance at that rule, so that it leaves circles. Nothing is learned and the run
-directory is not changed.
+samples its learned stochastic policy. A policy that has come to no new state for 15 decisions gains
+chance until it does, so that it leaves circles; --plain plays without that. Nothing is learned and
+the run directory is not changed.
 """
 
 import dataclasses
@@ -59,6 +59,8 @@ class Options(Settings):
     """Trials to play."""
     explore: bool = False
     """Sample the learned stochastic policy instead of its mean or greedy action."""
+    plain: bool = False
+    """Leave the policy as it is also where it runs in a circle."""
     best: bool = False
     """Take the checkpoint with the best last 10 trials instead of the latest."""
     seed: Annotated[int, Within(least=0)] = 1000
@@ -145,6 +147,7 @@ def evaluate(
     seed: Annotated[int, Within(least=0)] = 1000,
     render_mode: str | None = None,
     quiet: bool = True,
+    plain: bool = False,
 ) -> list[TrialRecord]:
     """Play trials without learning.
 
@@ -156,10 +159,11 @@ def evaluate(
         seed: seed of the motor noise and of the policy's chance.
         render_mode: ``human`` shows the trials in a window.
         quiet: show no progress.
+        plain: without the cure for loops.
     """
     env = make_env(config, render_mode=render_mode)
     try:
-        return played(env, agent, episodes, explore, seed, quiet)
+        return played(env, agent, episodes, explore, seed, quiet, plain)
     finally:
         env.close()
 
@@ -171,13 +175,14 @@ def played(
     explore: bool,
     seed: int,
     quiet: bool,
+    plain: bool = False,
 ) -> list[TrialRecord]:
     """Play trials without learning in an environment; arguments as in `evaluate`."""
     seeding.begin(env, agent, seed)
     records: list[TrialRecord] = []
     with Progress("evaluation", episodes, quiet=quiet) as progress:
         for trial in range(1, episodes + 1):
-            record, _ = play(env, agent, learn=False, explore=explore)
+            record, _ = play(env, agent, learn=False, explore=explore, plain=plain)
             records.append(dataclasses.replace(record, trial=trial))
             mean = sum(r.outcome for r in records) / trial
             said = f"return {mean:,.4g}" if record.success is None else f"goal in {mean:.0%}"
@@ -264,7 +269,15 @@ def plain(row: Estimate) -> dict[str, float | None]:
     return {k: None if math.isnan(v) else v for k, v in dataclasses.asdict(row).items()}
 
 
-def write_video(path: Path, config: Config, agent: Learner, seed: int, explore: bool) -> None:
+def loops(records: Sequence[TrialRecord]) -> str:
+    """In how many trials the cure for loops acted."""
+    helped = sum(bool(record.freed) for record in records)
+    return f"the way out of loops was used in {helped} of {plural(len(records), 'trial')}"
+
+
+def write_video(
+    path: Path, config: Config, agent: Learner, seed: int, explore: bool, plain: bool = False
+) -> None:
     """Film the first trial that `evaluate` plays with the same seed, 30 times as fast as it is.
 
     Raises:
@@ -272,7 +285,7 @@ def write_video(path: Path, config: Config, agent: Learner, seed: int, explore: 
     """
     small = {"steps_per_frame": 5, "size": 360} if config.env == MAZE else {}
     gifs = path.suffix.lower() == ".gif"
-    frames = film(config, agent, seed=seed, explore=explore, **(small if gifs else {}))
+    frames = film(config, agent, seed=seed, explore=explore, plain=plain, **(small if gifs else {}))
     checkpoint.write_atomically(path, gif(frames) if gifs else mp4(frames))
 
 
@@ -301,17 +314,21 @@ def run(options: Options) -> dict[str, Estimate]:
         options.seed,
         "human" if options.viewer else None,
         quiet=False,
+        plain=options.plain,
     )
     rows = summarise(records, optimum(config))
     print(learned(agent, path, state))
     print(f"{plural(options.episodes, 'trial')} with {policy} actions:")
     Console().print(table(rows))
+    if math.isfinite(agent.task.patience) and not options.plain:
+        print(loops(records))
     if options.json:
         results = {
             "checkpoint": str(path),
             "trials_learned": state["trial"],
             "rules": agent.net.n_rules,
             "policy": policy,
+            "plain": options.plain,
             "seed": options.seed,
             "confidence": CONFIDENCE,
             "results": {name: plain(row) for name, row in rows.items()},
@@ -323,7 +340,7 @@ def run(options: Options) -> dict[str, Estimate]:
         checkpoint.write_atomically(options.json, data.encode())
         print(f"written: {options.json}")
     if options.video:
-        write_video(options.video, config, agent, options.seed, options.explore)
+        write_video(options.video, config, agent, options.seed, options.explore, options.plain)
         print(f"written: {options.video}")
     return rows
 

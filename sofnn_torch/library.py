@@ -447,7 +447,6 @@ def _made(config: dict[str, Any], found: Spaces) -> Learner:
         found.actions,
         found.discrete,
         reward_scale=config["reward_scale"],
-        patience=float("inf"),
     )
     inputs, _ = learner.layout(settings, task)
     acting = len(inputs) > len(task.axes)

@@ -35,6 +35,7 @@ def play(
     learn: bool = True,
     explore: bool = True,
     trap: SignalTrap | None = None,
+    plain: bool = False,
 ) -> tuple[TrialRecord, Trajectory]:
     """One trial from the start to the goal or the trial's limit.
 
@@ -44,6 +45,7 @@ def play(
         learn: learn and grow; otherwise the agent is left as it is.
         explore: choose actions as in training (always so if learn).
         trap: where signals are noted.
+        plain: a frozen policy does without its cure for loops.
 
     Returns:
         The record of the trial (its number is 0) and the poses from the start on.
@@ -52,7 +54,8 @@ def play(
         Interrupted: a signal came; the agent is in the middle of a trial then.
         Divergence: the agent, the observation or the physics diverged.
     """
-    policy = agent if learn else FrozenPolicy(agent, explore)
+    frozen = None if learn else FrozenPolicy(agent, explore, plain)
+    policy = frozen or agent
     observation, info = env.reset()
     recorder = Recorder(env, observation, info)
     with Watch(agent, env, observation) as watch:
@@ -66,7 +69,9 @@ def play(
             action = policy.step(reward, observation, terminated, truncated)
             recorder.add(reward, observation, info)
             watch.check(reward)
-    return recorder.finish(agent, agent.statistics() if learn else {})
+    if frozen:
+        return recorder.finish(agent, {}, frozen.freed)
+    return recorder.finish(agent, agent.statistics())
 
 
 def train(config: Config, options: RunOptions | None = None) -> Path:

@@ -344,7 +344,12 @@ def test_a_start_that_fails_half_way_leaves_nothing(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "kind,count", [("file", n) for n in range(1, 15)] + [("fsync", n) for n in range(1, 6)]
+    "kind,count",
+    [
+        pytest.param(kind, n, marks=[pytest.mark.slow] * (n % 2))  # every second one by default
+        for kind, last in (("file", 14), ("fsync", 5))
+        for n in range(1, last + 1)
+    ],
 )
 def test_a_crash_at_any_instant_of_starting_leaves_a_whole_run_or_none(kind, count, tmp_path):
     config, options, run = settings(trials=1), quick_options(tmp_path / "runs"), tmp_path / "runs"

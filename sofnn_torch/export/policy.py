@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium.spaces import Box, Discrete
 
 from sofnn_torch.export import runtime
-from sofnn_torch.learners.frozen import MOST
+from sofnn_torch.learners.frozen import MOST, nearness
 from sofnn_torch.learners.learner import Learner
 from sofnn_torch.maze.odometry import FORWARD_SPEED, STEP_SECONDS, TURN_SPEED, WHEEL_BASE
 from sofnn_torch.rules.files import shortest
@@ -48,6 +48,7 @@ def describe(config: Config, agent: Learner) -> dict[str, Any]:
         "outputs": [output.name for output in agent.outputs],
         "decision": agent.decoding(),
         "patience": patience if math.isfinite(patience) else None,
+        "near": [d if math.isfinite(d) else None for d in nearness(task.axes)],
         "doublings": MOST,
         "command": _maze_command(config) if maze else _task_command(config),
     }

@@ -55,8 +55,8 @@ class Policy:
         >>> axis = {"name": "x", "unit": "", "low": 0, "high": 1, "period": 0}
         >>> policy = Policy({"format": FORMAT, "version": 1, "precision": "float32",
         ...     "axes": [axis], "clipped": True, "actions": ["back", "ahead"], "discrete": True,
-        ...     "outputs": ["mu", "sigma"], "decision": decision, "patience": None, "doublings": 10,
-        ...     "command": {"kind": "number", "first": 0}, "rules": [rule]})
+        ...     "outputs": ["mu", "sigma"], "decision": decision, "patience": None, "near": [0.1],
+        ...     "doublings": 10, "command": {"kind": "number", "first": 0}, "rules": [rule]})
         >>> policy.start([0.3])
         0
     """
@@ -66,10 +66,11 @@ class Policy:
         self.data, self.explore = data, explore
         self.discrete, self.decision = data["discrete"], data["decision"]
         self.robot: dict[str, Any] = data.get("robot") or {}
-        self.visits: Counter[int] = Counter()
+        self.returns: Counter[int] = Counter()
         try:
             self._take(data)
             self.reseed(0)
+            self._is_new(self.centres[0][: len(self.low)])
             self.command(self.act(self.centres[0][: len(self.low)], explore=1))
         except (KeyError, TypeError, IndexError, AttributeError, StopIteration) as error:
             raise ValueError(f"not a policy: {error!r:.80} is missing or out of place") from None
@@ -79,6 +80,9 @@ class Policy:
         """Take the numbers of a policy, in the precision of the network the same as there."""
         kind, axes = np.dtype(data["precision"]), data["axes"]
         self.patience = math.inf if data["patience"] is None else data["patience"]
+        self.near = np.array([np.inf if d is None else d for d in data["near"]], float)
+        self.turning = [(i, a["period"]) for i, a in enumerate(axes) if a["period"]]
+        self.seen, self.idle = np.empty((0, len(axes))), 0
         self.acting = bool(self.decision.get("action_input"))
         kept = [data["clipped"] and not axis["period"] for axis in axes]
         ends = [
@@ -104,19 +108,31 @@ class Policy:
 
     def start(self, observation: Any) -> Any:
         """Begin a trial; its first action, as `act`."""
-        self.visits.clear()
+        self.returns.clear()
+        self.seen, self.idle = self.seen[:0], 0
         return self.step(observation)
 
     def step(self, observation: Any) -> Any:
         """The next action.
 
-        With each decision after some ``patience`` at the same rule within one trial the learned
-        chance is added 1, 3, 7, ... times there: a policy without chance would run in a circle.
+        A policy without chance would run in a circle: with each decision after some ``patience``
+        without a new state the learned chance is added 1, 3, 7, ... times at the strongest rule.
         """
-        rule = self.strongest_rule(observation)
-        self.visits[rule] += 1
-        doublings = min(max(self.visits[rule] - self.patience, 0), self.data["doublings"])
+        self.idle = 0 if self.patience == math.inf or self._is_new(observation) else self.idle + 1
+        stuck, doublings = self.idle >= self.patience, 0
+        if stuck or self.returns:
+            self.returns[rule := self.strongest_rule(observation)] += stuck
+            doublings = min(self.returns[rule], self.data["doublings"])
         return self.act(observation, self.explore + 2**doublings - 1)
+
+    def _is_new(self, observation: Any) -> bool:
+        """Whether no state of the trial is near the observation (n,), which then becomes one."""
+        apart = self.seen - observation
+        for i, period in self.turning:
+            apart[:, i] -= period * np.round(apart[:, i] / period)
+        new = not (((apart / self.near) ** 2).sum(1) <= 1).any()
+        self.seen = np.vstack([self.seen, observation]) if new else self.seen
+        return new
 
     def act(self, observation: Any, explore: float = 0) -> Any:
         """The action at an observation (n,): its number, or numbers (m,) in [-1, 1].

@@ -42,13 +42,16 @@ class Task:
         wheels: wheel speeds of a scalar action of a robot, over the fastest (for the coding
             ``wheels`` of Q-learning).
         reward_scale: factor of each reward before it is learned from; values are in its unit.
-        patience: decisions at one rule after which a policy that does not learn is taken to run in
-            a circle; inf for never.
+        patience: decisions in a row without a new state after which a policy that does not learn
+            is taken to run in a circle; inf for never.
+
+    Raises:
+        ValueError: patience has an end and an axis has none: what is a new state then?
 
     Examples:
         >>> from sofnn_torch.network.axes import Axis
         >>> Task((Axis("speed", "m/s", 0, 2),), ("brake", "drive"), discrete=True).patience
-        4
+        inf
     """
 
     axes: tuple[Axis, ...]
@@ -56,7 +59,12 @@ class Task:
     discrete: bool
     wheels: Callable[[float], list[float]] | None = None
     reward_scale: float = 1.0
-    patience: float = 4
+    patience: float = math.inf
+
+    def __post_init__(self) -> None:
+        """Check that states can be compared where they must be."""
+        if self.patience < math.inf and not all(axis.bounded for axis in self.axes):
+            raise ValueError("patience needs axes with a low and a high end")
 
 
 @dataclass(frozen=True)

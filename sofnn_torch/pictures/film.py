@@ -30,8 +30,8 @@ def film(config: Config, agent: Learner, **options: Any) -> Iterator[NDArray[np.
     Args:
         config: settings of the run.
         agent: the learner; only its random generator moves, and is set back.
-        **options: ``seed``, ``explore`` and ``limit``, and in the maze also ``steps_per_frame`` and
-            ``size``, see `maze_film`.
+        **options: ``seed``, ``explore``, ``plain`` and ``limit``, and in the maze also
+            ``steps_per_frame`` and ``size``, see `maze_film`.
 
     Raises:
         ValueError: the task cannot be drawn here.
@@ -41,7 +41,12 @@ def film(config: Config, agent: Learner, **options: Any) -> Iterator[NDArray[np.
 
 
 def task_film(
-    config: Config, agent: Learner, seed: int = 0, explore: bool = False, limit: int = 20_000
+    config: Config,
+    agent: Learner,
+    seed: int = 0,
+    explore: bool = False,
+    plain: bool = False,
+    limit: int = 20_000,
 ) -> Iterator[NDArray[np.uint8]]:
     """Frames as the environment draws them, one for each step."""
     env = make_task(config, "rgb_array")
@@ -49,7 +54,7 @@ def task_film(
     try:
         seeding.begin(env, agent, seed)
         observation, _ = env.reset()  # as in a series of trials, where only the first is seeded
-        policy, over = FrozenPolicy(agent, explore), False
+        policy, over = FrozenPolicy(agent, explore, plain), False
         yield env.render()
         while not over and env.steps < limit:
             observation, _, terminated, truncated, _ = env.step(policy.act(observation))
@@ -65,6 +70,7 @@ def maze_film(
     agent: Learner,
     seed: int = 0,
     explore: bool = False,
+    plain: bool = False,
     steps_per_frame: int = 2,
     limit: int = 20_000,
     size: int = 480,
@@ -76,6 +82,7 @@ def maze_film(
         agent: the learner.
         seed: seed of the motor noise and of the policy's chance.
         explore: sample the stochastic policy.
+        plain: without the cure for loops.
         steps_per_frame: simulator steps from one frame to the next.
         limit: steps after which the film ends.
         size: width and height of the frames in pixels.
@@ -101,7 +108,7 @@ def maze_film(
     rng = agent.rng  # a film must not change the training
     try:
         seeding.begin(env, agent, seed)
-        policy = FrozenPolicy(agent, explore)
+        policy = FrozenPolicy(agent, explore, plain)
         observation, _ = env.reset()  # as in a series of trials, where only the first is seeded
         env.on_simulator_step, over = after_step, False
         shoot()

@@ -33,6 +33,7 @@ from sofnn_torch.tasks.survey import survey
 PRESET: Any = None  # as a default: the value of the preset
 MAZE = "maze"
 BASIC = ("env", "agent", "network", "preset", "seed")  # the preset of all others depends on them
+PATIENCE = 15  # decisions in the maze without a new state, after which a policy circles
 Input = tuple[str, str, float, float, float]
 
 
@@ -119,10 +120,11 @@ class Config(Settings):
         """What is learned."""
         if self.env == MAZE:
             kind = self.maze.actions
-            return Task(self.maze.axes, ACTION_NAMES[kind], kind == "three", wheel_speeds)
+            names, discrete = ACTION_NAMES[kind], kind == "three"
+            return Task(self.maze.axes, names, discrete, wheel_speeds, patience=PATIENCE)
         found, axes = look(self.env), named([Axis(*given) for given in self.axes])
         scale = self.reward_scale
-        return Task(axes, found.actions, found.discrete, reward_scale=scale, patience=math.inf)
+        return Task(axes, found.actions, found.discrete, reward_scale=scale)
 
     def to_json(self) -> str:
         """The settings as readable JSON."""

@@ -36,6 +36,8 @@ class TrialRecord:
     """What the environment measured (`env.measure`)."""
     statistics: dict[str, float] = field(default_factory=dict)
     """What the learner measured (`agent.statistics()`)."""
+    freed: int | None = None
+    """Decisions at which a frozen policy got more chance, to leave a loop; None in training."""
 
     @property
     def outcome(self) -> float:
@@ -48,6 +50,8 @@ class TrialRecord:
         row = {name: getattr(self, name) for name in names}
         if self.success is None:
             del row["success"]
+        if self.freed is not None:
+            row["freed"] = self.freed
         counts = {name: n for name, n in self.measures.items() if isinstance(n, int)}
         return row | counts | {"rules": self.rules} | self.measures | self.statistics
 
@@ -102,9 +106,15 @@ class Recorder:
         self.infos.append(info)
 
     def finish(
-        self, agent: Learner, statistics: dict[str, float]
+        self, agent: Learner, statistics: dict[str, float], freed: int | None = None
     ) -> tuple[TrialRecord, Trajectory]:
-        """The record of the trial and the states from the start on."""
+        """The record of the trial and the states from the start on.
+
+        Args:
+            agent: the learner.
+            statistics: what it measured.
+            freed: decisions at which a frozen policy got more chance.
+        """
         last, seen = self.infos[-1], list(zip(self.infos, self.observations, strict=True))
         true, estimated = (
             np.array([info.get(name, x) for info, x in seen])
@@ -122,5 +132,6 @@ class Recorder:
             rules=agent.net.n_rules,
             measures=self.env.unwrapped.measure(self.infos),
             statistics=statistics,
+            freed=freed,
         )
         return record, path
