@@ -55,10 +55,10 @@ def test_a_rule_keeps_its_chance_and_after_a_new_state_the_count_begins_anew():
     assert explored == [0] * 15 + [1, 3] + [0] + [3] * 14 + [7, 15]
 
 
-def test_states_are_the_same_within_a_sixtieth_of_the_range_of_each_input_and_whole_turns():
+def test_states_are_the_same_within_a_fortieth_of_the_range_of_each_input_and_whole_turns():
     agent = contradiction()
     widest = [axis.high - axis.low for axis in AXES]
-    for i, near in enumerate(np.array(widest) / 60):
+    for i, near in enumerate(np.array(widest) / 40):
         step = np.eye(3)[i] * near
         still = spy(agent, [EAST + (k % 2) * 0.99 * step for k in range(20)])
         assert any(still) and not any(spy(agent, [EAST + k * 1.01 * step for k in range(20)])), i
@@ -107,7 +107,7 @@ def test_a_loop_is_left_within_a_few_turns():
 @pytest.mark.parametrize("make", [q_learner, sga_learner])
 def test_a_way_without_returns_is_that_of_the_learned_policy(make):
     agent = patient(make(rules=40))
-    east = [EAST + [0.002 * k, 0, 0] for k in range(200)]  # 2 mm a decision, along a wall
+    east = [EAST + [0.002 * k, 0, 0] for k in range(200)]  # 2 mm a decision along a wall
     turning = [EAST + [0, 0, 0.02 * k] for k in range(200)]
     policy = FrozenPolicy(agent)
     assert [policy.act(c) for c in east + turning] == [agent.act(c) for c in east + turning]

@@ -127,11 +127,11 @@ class Policy:
 
     def _is_new(self, observation: Any) -> bool:
         """Whether no state of the trial is near the observation (n,), which then becomes one."""
-        apart = self.seen - observation
+        apart = self.seen - (x := self.state(observation))
         for i, period in self.turning:
             apart[:, i] -= period * np.round(apart[:, i] / period)
         new = not (((apart / self.near) ** 2).sum(1) <= 1).any()
-        self.seen = np.vstack([self.seen, observation]) if new else self.seen
+        self.seen = np.vstack([self.seen, x]) if new else self.seen
         return new
 
     def act(self, observation: Any, explore: float = 0) -> Any:

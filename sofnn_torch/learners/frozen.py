@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from sofnn_torch.learners.learner import Action, Learner
 from sofnn_torch.network.axes import Axis
 
-NEAR = 1 / 60  # of the range of each input: states so near to each other count as one
+NEAR = 1 / 40  # of the range of each input: states so near to each other count as one
 MOST = 10  # doublings: by then every action is about as likely
 
 

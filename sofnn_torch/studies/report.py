@@ -29,8 +29,8 @@ brackets; success is the mean over the seeds. *Arriving* is the number of seeds 
 the first {in_a_row} in a row under {within} times the optimum (in training, so exploration
 included); a run where that never happens counts as more than its number of trials. What was
 learned is then played for {episodes} trials without learning: *greedy* is the mean action (SGA) or
-the best one (Q), *sampled* the stochastic policy of the training; both gain chance where they run in
-[circles](../paper.md#what-plays-in-an-evaluation-and-loops). A trial that fails counts with its
+the best one (Q), *sampled* the stochastic policy of the training; both gain chance where they run
+in [circles](../paper.md#what-plays-in-an-evaluation-and-loops). A trial that fails counts with its
 {limit:,} steps. The kinematic optimum of the maze, with actions held 10 steps, is {optimum} steps
 (`python -m sofnn_torch.maze.optimum`)."""
 DIVERGED = """\
