@@ -79,10 +79,11 @@ def test_a_state_of_another_size_is_refused(rows, count):
         memory.load_state_dict({"rows": torch.zeros(rows), "count": count})
 
 
+@pytest.mark.parametrize("gap", [0.0, 0.4])
 @pytest.mark.parametrize("coding", CODINGS)
-def test_q_replay_is_the_bounded_sum_of_semi_gradients(coding, batch):
+def test_q_replay_is_the_bounded_sum_of_semi_gradients(coding, gap, batch):
     rates = {"rate_state": 0.1, "rate_action": 0.2, "rate_constant": 0.3}
-    agent = q_learner(coding, replays=1, gamma=0.9, value_limit=0.1, **rates)
+    agent = q_learner(coding, replays=1, gamma=0.9, value_limit=0.1, action_gap=gap, **rates)
     play(agent)
     net, rows = agent.net, agent.memory.rows
     before, length = net.consequents.numpy().copy(), net.n_outputs
@@ -90,12 +91,13 @@ def test_q_replay_is_the_bounded_sum_of_semi_gradients(coding, batch):
     for i in batch:
         features, (reward, continues), ahead = np.split(rows[i], [length, length + 2])
         s = normalised(net, features[: net.n_inputs])
-        values = []
-        for code in agent.codes.numpy():
-            f = np.concatenate([ahead, code, [1.0]])
-            values.append(normalised(net, f[: net.n_inputs]) @ before @ f)
-        best.append(max(values))
-        error = reward + 0.9 * continues * min(max(values), 0.1) - s @ before @ features
+        value, most = s @ before @ features, []
+        for at in (features[:3], ahead):
+            sets = [np.concatenate([at, code, [1.0]]) for code in agent.codes.numpy()]
+            most.append(max(normalised(net, f[: net.n_inputs]) @ before @ f for f in sets))
+        best.append(most[1])
+        error = reward + 0.9 * continues * min(most[1], 0.1) - value
+        error -= gap * max(most[0] - value, 0)
         total += error * np.outer(s, features)
         mass += np.outer(s, np.abs(features))
     assert min(best) < 0.1 < max(best)

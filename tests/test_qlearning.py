@@ -45,7 +45,7 @@ def learner(
         centre = torch.rand(inputs).double() * 2 - 1
         centre[2] *= math.pi
         net.add_rule(centre, 0.2 + torch.rand(inputs).double(), torch.randn(outputs).double())
-    settings = {"value_limit": None, "replays": 0} | settings
+    settings = {"value_limit": None, "replays": 0, "action_gap": 0.0} | settings
     names = ("right", "straight", "left") if actions == "three" else ("steer",)
     task = Task(net.axes[:N], names, actions == "three", wheel_speeds)
     return QLearning(net, task, QConfig(coding=coding, segments=segments, **settings), seed)
@@ -98,20 +98,24 @@ def test_autograd_is_the_closed_form_of_equations_14_and_15(seed, coding, headin
     torch.testing.assert_close(agent.net.traces, gradient, rtol=tolerance, atol=tolerance)
 
 
-def test_one_step_is_the_semi_gradient_update_with_the_brute_force_maximum():
-    agent = learner("wheels", gamma=0.9, trace_decay=0.0, trace_limit=None, **RATES)
+@pytest.mark.parametrize("gap", [0.0, 0.4])
+@pytest.mark.parametrize("greedy", [True, False])
+def test_one_step_is_the_semi_gradient_update_with_the_brute_force_maximum(greedy, gap):
+    agent = learner("wheels", gamma=0.9, trace_decay=0.0, trace_limit=None, action_gap=gap, **RATES)
+    agent._draw = lambda values: (values.index((max if greedy else min)(values)), 0.0)
     x, following = torch.tensor([0.2, -0.3, 0.5]).double(), torch.tensor([0.3, 0.1, -2.0]).double()
     command = agent.start(x.numpy())
     features, _ = chosen(agent, command, x)
     q, gradient = closed_form(agent.net, x, features)
-    best = max(
-        closed_form(agent.net, following, chosen(agent, j, following)[0])[0].item()
-        for j in range(3)
+    here, best = (
+        max(closed_form(agent.net, at, chosen(agent, j, at)[0])[0].item() for j in range(3))
+        for at in (x, following)
     )
+    assert (here - q.item() < 1e-9) == greedy
     before = agent.net.table().detach().clone()
     agent.step(0.5, following.numpy(), False)
     rates = [0.01] * N + [0.02] * N + [0.1] * N + [0.2] * 2 + [0.3]
-    error = 0.5 + 0.9 * best - q.item()
+    error = 0.5 + 0.9 * best - q.item() - gap * (here - q.item())
     expected = before + torch.tensor(rates).double()[:, None] * error * gradient
     torch.testing.assert_close(agent.net.table().detach(), expected)
 

@@ -10,7 +10,10 @@ Each rule concludes a linear function of the state and the action, and the netwo
 
 The range [-1, 1] of the scalar action is cut into J equal segments; one is drawn by roulette
 (eq. 11) and the action uniformly inside it. The gradient comes from autograd for antecedents and
-consequents; as usual the target is held constant (semi-gradient).
+consequents; as usual the target is held constant (semi-gradient). Of what an action is worth less
+than the best of its state, dQ takes off a share more: actions whose values lie close together, as
+they do where decisions are frequent, move apart and the best of them stays the best (advantage
+learning: Bellemare et al., Increasing the action gap, AAAI 2016).
 """
 
 import math
@@ -59,6 +62,9 @@ class QConfig(Settings, table="q"):
     value_limit: float | None = 100.0
     """Bound of the value of the next state in the TD error, the goal's reward; None for no
     bound."""
+    action_gap: Share = 0.5
+    """Share of what an action is worth less than the best that is taken off its value in the TD
+    error: values of actions move apart; 0 in the paper."""
     rate_state: NotNegative = 0.0
     """Learning rate of c_x."""
     rate_action: NotNegative = 1.0
@@ -111,6 +117,7 @@ class QLearning(Learner):
         self.n, self.coding = len(task.axes), settings.coding
         self.segments = segments = len(task.actions) if task.discrete else settings.segments
         self.gamma, self.decay = settings.gamma, settings.gamma * settings.trace_decay
+        self.behind = 0.0  # what the last action was taken off
         self.value_limit = math.inf if settings.value_limit is None else settings.value_limit
         self.antecedents = settings.rate_centre > 0 or settings.rate_width > 0
         length = net.n_outputs - self.n - 1  # of the action vector
@@ -264,7 +271,9 @@ class QLearning(Learner):
             firing = net.normalised_firing(x, antecedents)
         outputs = consequents @ firing
         self.value = (features @ outputs.detach()).item()
-        greedy = values[segment] == max(values)
+        best = max(values)
+        self.behind = self.settings.action_gap * max(best - self.value, 0.0)
+        greedy = values[segment] == best
         decay = self.decay if greedy or not self.settings.trace_cut else 0.0
         gradient = torch.autograd.grad(outputs, parameters, features)[0]  # of features . outputs
         net.accumulate(gradient, decay, self.settings.trace_limit)
@@ -276,9 +285,9 @@ class QLearning(Learner):
     def _error(self, reward: float, x: Tensor | None = None, firing: Tensor | None = None) -> float:
         """The temporal-difference error (eqs 12, 13)."""
         if x is None or firing is None:
-            return reward - self.value
+            return reward - self.value - self.behind
         ahead = min(max(self.action_values(x, firing).tolist()), self.value_limit)
-        return reward + self.gamma * ahead - self.value
+        return reward + self.gamma * ahead - self.value - self.behind
 
     def _learn(self, error: float) -> None:
         """Equations 14 and 15 for the temporal-difference error."""
@@ -288,6 +297,7 @@ class QLearning(Learner):
     def _replay(self, memory: ReplayMemory) -> None:
         """Equations 12-15 for batches of remembered decisions; the antecedents stay."""
         net, (features_of, firing_at) = self.net, self.net.firing_functions()
+        gap, acting = self.settings.action_gap, self.coding == "antecedent"
         seen = memory.sample(self.settings.replays, self.rng, self.rates)
         states = features_of(seen["features"][..., : net.n_inputs])
         next_states = features_of(self.network_inputs(seen["next_state"]))
@@ -297,6 +307,11 @@ class QLearning(Learner):
             firing, consequents = firing_at(x), net.learnable(antecedents=False)
             value = (features.T * (consequents @ firing.T)).sum(0)
             target = reward + self.gamma * continues * best.clamp_(max=self.value_limit)
+            if gap:
+                state = features[:, : self.n]
+                at = firing_at(features_of(self.network_inputs(state))) if acting else firing
+                behind = self.action_values(state, at).amax(-1) - value.detach()
+                target -= gap * behind.clamp_(min=0.0)
             (gradient,) = torch.autograd.grad(value, consequents, target - value.detach())
             net.adapt_batch(self.replay_rates, gradient, features.T.abs() @ firing)
 

@@ -88,6 +88,7 @@ def _paper(agent: str) -> dict[str, Any]:
         trace_cut=False,
         trace_limit=None,
         value_limit=None,
+        action_gap=0.0,
         rate_state=0.1,
         rate_action=0.1,
         rate_constant=0.1,

@@ -109,6 +109,7 @@ HELPS: dict[str, dict[str, Arm]] = {
         "no-trace-cut": {"q.trace_cut": False},
         "no-trace-limit": {"q.trace_limit": None},
         "no-value-limit": {"q.value_limit": None},
+        "no-action-gap": {"q.action_gap": 0.0},
         "interpolation": {"net.interpolate": True},
         "coding-wheels": {"q.coding": "wheels"},
         "coding-scalar": {"q.coding": "scalar"},
