@@ -192,7 +192,7 @@ def test_a_page_can_be_followed_from_its_top_to_its_end(page, place, tmp_path):
     here = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
     environment = os.environ | {
         "PATH": here,
-        "PYTHONPATH": str(ROOT),
+        "PYTHONPATH": f"{folder}{os.pathsep}{ROOT}",  # train.py is a link: its folder is another
         "RUN": "runs/sga-sofnn-estimated-s0",
         "MPLBACKEND": "agg",
     }

@@ -96,6 +96,16 @@ def test_the_installed_package_trains_and_evaluates_elsewhere(home):
     assert len(json.loads((home / "r.json").read_text())["trials"]) == 2
 
 
+@pytest.mark.slow
+def test_the_files_of_a_release_pass_the_check_of_a_package_index(tmp_path):
+    pytest.importorskip("twine", reason="needs twine: pip install twine")
+    build = (sys.executable, "-m", "build", "--no-isolation", "--outdir", tmp_path, ROOT)
+    run(*build, cwd=tmp_path)
+    files = sorted(tmp_path.iterdir())
+    assert [file.suffix for file in files] == [".whl", ".gz"]
+    run(sys.executable, "-m", "twine", "check", "--strict", *files, cwd=tmp_path)
+
+
 def test_constraints_pin_every_requirement():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     extras = project["optional-dependencies"]
