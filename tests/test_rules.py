@@ -24,7 +24,7 @@ from sofnn_torch.runs.directory import load_config
 from sofnn_torch.runs.factory import make_agent
 
 SHORT = {"max_steps": 80}
-ADAPT = {"rate_centre": 0.001, "rate_width": 0.001}  # numbers with all their digits
+ADAPT = {"rate_centre": 1e-4, "rate_width": 1e-4}  # numbers with all their digits
 VARIANTS = {
     "three": settings("sga", sga=ADAPT),
     "steer": settings("sga", maze={"actions": "steer"}),
