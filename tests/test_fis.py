@@ -1,5 +1,6 @@
 """Fuzzy systems in .fis files: as Octave evaluates them, read again, and rules of another tool."""
 
+import dataclasses
 import shutil
 import subprocess
 
@@ -77,6 +78,21 @@ def test_a_written_system_concludes_as_the_policy_and_is_read_again(tmp_path, ki
         twins = base.outputs_at(x.astype(float))
         # Twins of rules as wide as these, up to 1.26 rad, add a little half a turn away.
         assert np.abs(twins - means(ours, x)).max() < 0.05
+
+
+def test_rules_that_are_nearly_or_quite_the_same_stay_as_many(tmp_path):
+    """Only a rule a whole turn away is the same: each counts in a normalised sum."""
+    data = policy.describe(*learner("three"))
+    base = fis.system(data)
+    near = base.centres[:1] + [1e-7, 0, 0]
+    more = dataclasses.replace(
+        base,
+        centres=np.vstack([base.centres, base.centres[:1], near]),
+        widths=np.vstack([base.widths, base.widths[:1], base.widths[:1]]),
+        slopes=np.vstack([base.slopes, base.slopes[:1], base.slopes[:1]]),
+    )
+    rules = fis.as_policy(more, data)["rules"]
+    assert len(rules) == len(data["rules"]) + 2
 
 
 def means(ours, x):

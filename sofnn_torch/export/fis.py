@@ -5,6 +5,7 @@ The normalised sum of Gaussian rules is what these tools call Sugeno inference w
 """
 
 import re
+from collections import Counter
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -235,6 +236,26 @@ def _numbers(text: str, count: int, what: str) -> list[float]:
     return values
 
 
+def _without_twins(table: NDArray[Any], turns: NDArray[Any]) -> list[int]:
+    """Rules (K, c) but for those that are others a turn away; equal rules at one turn are two.
+
+    Args:
+        table: the rules within one turn, equal to five decimals where they are twins.
+        turns: by how many turns each was away. Shape: (K, p).
+    """
+    found: set[tuple[Any, ...]] = set()
+    times: Counter[tuple[Any, ...]] = Counter()
+    kept = []
+    rows = zip(np.round(table, 5).tolist(), turns.tolist(), strict=True)
+    for number, (rule, away) in enumerate(rows):
+        place = (*rule, *away)
+        times[place] += 1
+        if (this := (*rule, times[place])) not in found:
+            found.add(this)
+            kept.append(number)
+    return kept
+
+
 def as_policy(base: Sugeno, like: dict[str, Any]) -> dict[str, Any]:
     """A policy that decides as another one, by the rules of a system.
 
@@ -263,13 +284,14 @@ def as_policy(base: Sugeno, like: dict[str, Any]) -> dict[str, Any]:
             raise ValueError("values that differ between actions so cannot be coded as in --like")
         consequents = np.hstack([base.slopes[:, 0, :-1], weights])
     kind, centres = np.dtype(like["precision"]), base.centres.copy()
-    for i in np.flatnonzero(policy.periods):
+    turning = np.flatnonzero(policy.periods)
+    for i in turning:
         low = like["axes"][i]["low"] or 0.0
         # In the network's precision twins are equal again, but at the seam.
         centres[:, i] = low + np.mod(centres[:, i] - low, policy.periods[i])
     table = np.hstack([centres, base.widths, consequents]).astype(kind)
-    _, first = np.unique(np.round(table.astype(float), 5), axis=0, return_index=True)
-    table = shortest(table[np.sort(first)])
+    turns = np.round((base.centres - centres)[:, turning] / policy.periods[turning])
+    table = shortest(table[_without_twins(table.astype(float), turns)])
     parts = (table[:, :n].tolist(), table[:, n : 2 * n].tolist(), table[:, 2 * n :].tolist())
     names = ("centre", "width", "consequents")
     rules = [dict(zip(names, row, strict=True)) for row in zip(*parts, strict=True)]
