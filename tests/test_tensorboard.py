@@ -237,15 +237,22 @@ def test_the_film_shows_the_trial_that_evaluation_plays(sga_trial, monkeypatch, 
     seeding.begin(env, agent, 5)
     _, path = play(env, agent, learn=False, explore=explore)
     env.close()
-    before_film = agent.rng.bit_generator.state
+    rng, before_film = agent.rng, agent.rng.random() and agent.rng.bit_generator.state
     monkeypatch.setattr(film_module, "OffscreenRenderer", Camera)
     before = Camera.closed
     frames = list(film(config, agent, seed=5, explore=explore, steps_per_frame=4))
     assert len(frames) == 1 + 150 // 4 + 1  # the start, every fourth step, the end
     assert frames[0][0, 0] == pytest.approx(path.true[0, :2])
     assert frames[-1][0, 0] == pytest.approx(path.true[-1, :2])
-    assert agent.rng.bit_generator.state == before_film
+    assert agent.rng is rng and rng.bit_generator.state == before_film
     assert Camera.closed == before + 1
+
+
+def test_an_animation_shows_a_dozen_frames_a_second_for_ever():
+    data = gif(iter(np.random.default_rng(0).integers(0, 255, (3, 8, 8, 3), np.uint8)))
+    picture = Image.open(io.BytesIO(data))
+    assert picture.n_frames == 3 and picture.info["loop"] == 0
+    assert picture.info["duration"] == pytest.approx(1000 / 12, abs=10)  # in hundredths of a second
 
 
 def test_a_film_of_a_robot_that_does_not_arrive_ends(sga_trial, monkeypatch):

@@ -118,6 +118,7 @@ def test_a_window_that_is_closed_in_a_pause_lets_the_robot_go_on(maze, windows):
     window.press(viewer.SPACE)
     driver = threading.Thread(target=maze.step, args=(STRAIGHT,), daemon=True)
     driver.start()
+    time.sleep(0.5)  # it waits by now
     window.open = False
     driver.join(20)
     assert not driver.is_alive() and maze.total_steps == 10
