@@ -7,7 +7,7 @@ numbers. So nothing that is learned or logged depends on when a run was interrup
 
 import dataclasses
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,8 @@ from sofnn_torch.runs.signals import Interrupted, SignalTrap
 from sofnn_torch.runs.trial import Recorder, Trajectory, TrialRecord
 from sofnn_torch.streams import output
 from sofnn_torch.terminal import plural, say
+
+After = Callable[[TrialRecord], bool]
 
 __all__ = ["RunOptions", "play", "play_again", "resume", "train"]
 
@@ -74,8 +76,13 @@ def play(
     return recorder.finish(agent, agent.statistics())
 
 
-def train(config: Config, options: RunOptions | None = None) -> Path:
+def train(config: Config, options: RunOptions | None = None, after: After | None = None) -> Path:
     """Train from the beginning; the directory of the run.
+
+    Args:
+        config: the settings.
+        options: how the run is kept and shown.
+        after: called with the record of each trial; a true answer ends the run, which is saved.
 
     Raises:
         ValueError: settings or run directory cannot be used; nothing was written then.
@@ -85,10 +92,15 @@ def train(config: Config, options: RunOptions | None = None) -> Path:
     """
     options = options or RunOptions()
     with SignalTrap() as trap, output(), arithmetic(options.threads, options.portable):
-        return _loop(session.begin(config, options), options, trap)
+        return _loop(session.begin(config, options), options, trap, after)
 
 
-def resume(path: Path | str, options: RunOptions | None = None, trials: int | None = None) -> Path:
+def resume(
+    path: Path | str,
+    options: RunOptions | None = None,
+    trials: int | None = None,
+    after: After | None = None,
+) -> Path:
     """Go on with a run, bit for bit as if it had never stopped; its directory.
 
     Args:
@@ -96,6 +108,7 @@ def resume(path: Path | str, options: RunOptions | None = None, trials: int | No
             directory goes on in a new one.
         options: how the run is kept and shown.
         trials: new total of trials; None for the one of the run.
+        after: as for `train`.
 
     Raises:
         CheckpointError: no checkpoint fits; the message names the last good one, if any.
@@ -108,7 +121,7 @@ def resume(path: Path | str, options: RunOptions | None = None, trials: int | No
             reopened.close()
             say(f"{path} has all its {reopened.trial} trials: go further with --trials N")
             return reopened.run.path
-        return _loop(reopened, options, trap)
+        return _loop(reopened, options, trap, after)
 
 
 @arithmetic()
@@ -128,7 +141,7 @@ def play_again(path: Path | str) -> None:
     say(f"trial {state['trial'] + 1}: {learned}, no divergence")
 
 
-def _loop(session: Session, options: RunOptions, trap: SignalTrap) -> Path:
+def _loop(session: Session, options: RunOptions, trap: SignalTrap, after: After | None) -> Path:
     """Trials until all are done; whatever ends the loop, the last whole trial is saved."""
     run, agent = session.run, session.agent
     monitor = Monitor(
@@ -159,6 +172,8 @@ def _loop(session: Session, options: RunOptions, trap: SignalTrap) -> Path:
                 rules = plural(agent.net.max_rules, "rule")
                 run.warn("cap", f"{rules} reached (--net.max-rules): no more are added")
             progress.update(seconds=seconds, facts=summary(record, session.state["recent"], speed))
+            if after and after(record):
+                break
     except Interrupted as stop:
         stop.run = run.path
         raise

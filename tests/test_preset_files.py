@@ -96,7 +96,7 @@ def test_what_is_wrong_in_a_file_is_one_line_that_names_it(text, message, file, 
 @pytest.mark.parametrize(
     "words,message",
     [
-        (["--settings", "nowhere"], "--settings nowhere cannot be read (No such file"),
+        (["--settings", "nowhere"], "nowhere cannot be read (No such file"),
         (["--settings", "best.toml", "--agent", "sga"], "q.trace_limit has no effect"),
         (["--settings", "best.toml", "--resume", "x"], "not a run directory"),
     ],

@@ -61,7 +61,7 @@ def read(path: Path) -> dict[str, Any]:
     try:
         data = tomllib.loads(checkpoint.read_file(path, LARGEST_SETTINGS).decode())
     except OSError as error:
-        raise ValueError(f"--settings {path} cannot be read ({error.strerror})") from None
+        raise ValueError(f"{path} cannot be read ({error.strerror})") from None
     except RecursionError:
         raise ValueError(f"{path}: not a TOML file (nested too deeply)") from None
     except ValueError as error:  # not TOML, or not UTF-8
