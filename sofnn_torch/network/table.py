@@ -14,7 +14,15 @@ from sofnn_torch.network.store import RuleStore
 
 
 class RuleTable(RuleStore):
-    """Rules that learn; `RuleStore` describes what they hold and its arguments."""
+    """Rules that learn; `RuleStore` describes what they hold and its arguments.
+
+    Attributes:
+        given: the first so many rules learn at other rates, see `given_rate`.
+        given_rate: factor of the learning rates of the given rules; 0 keeps them as they are.
+    """
+
+    given = 0
+    given_rate = 1.0
 
     # --------------------------------------------------------------- learning, eqs 6, 8, 14, 15
 
@@ -46,7 +54,7 @@ class RuleTable(RuleStore):
             error: the reinforcement.
         """
         parameters, traces = self._learning[rates.shape[0]]
-        parameters.addcmul_(rates, traces, value=error)
+        parameters.addcmul_(self._own(rates), traces, value=error)
         if parameters is self._active:
             self._widths.clamp_(min=self.min_width)
 
@@ -62,7 +70,15 @@ class RuleTable(RuleStore):
             mass: summed firing that the gradient of a consequent holds. Shape: (K,) or (rows, K).
         """
         parameters, _ = self._learning[gradient.shape[0]]
-        parameters.add_(rates * gradient / mass.clamp(min=1.0))
+        parameters.add_(self._own(rates) * gradient / mass.clamp(min=1.0))
+
+    def _own(self, rates: Tensor) -> Tensor:
+        """Learning rates (rows, 1), or (rows, K) where given rules have others."""
+        if not self.given or self.given_rate == 1.0:
+            return rates
+        factors = rates.new_ones(self.n_rules)
+        factors[: self.given] = self.given_rate
+        return rates * factors
 
     def clamp_consequents(self, first: int, last: int, low: float, high: float) -> None:
         """Keep the consequents first..last-1 of every rule between low and high."""

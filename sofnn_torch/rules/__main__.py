@@ -5,12 +5,14 @@
     python -m sofnn_torch.rules RUN --within 0.1 0.2 0.1 0.2 60 120   # what it can do in a region
     python -m sofnn_torch.rules RUN --json rules.json --csv rules.csv --picture rules.png
     python -m sofnn_torch.rules RUN --load rules.json      # edited rules become a new run
+    python -m sofnn_torch.rules --new rules.csv            # rules alone do: with flags of train.py
 
 The run directory is not changed. docs/rules.md says how to read a rule and what a file holds.
 """
 
 import math
 import signal
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -26,7 +28,7 @@ from sofnn_torch.bounds import Settings, Within
 from sofnn_torch.evaluate import learned, load
 from sofnn_torch.learners.learner import Learner
 from sofnn_torch.pictures import figures
-from sofnn_torch.rules import files, tables, words
+from sofnn_torch.rules import files, new, tables, words
 from sofnn_torch.rules.editing import edited
 from sofnn_torch.rules.regions import actions_within
 from sofnn_torch.rules.words import Reading
@@ -34,7 +36,7 @@ from sofnn_torch.runs import checkpoint, seeding
 from sofnn_torch.runs.factory import make_env, make_plan
 from sofnn_torch.runs.session import RunOptions, arithmetic
 from sofnn_torch.runs.settings import MAZE, Config
-from sofnn_torch.terminal import check_output, command, plural, say
+from sofnn_torch.terminal import attempt, check_output, command, plural, say
 from sofnn_torch.training import play
 
 PICTURES = (".png", ".svg", ".pdf")
@@ -187,8 +189,8 @@ def run(options: Options) -> None:
     if options.picture and config.env != MAZE:
         raise ValueError(f"--picture is for the maze, not for --env {config.env}")
     if options.load:
-        new, rules = edited(options.run, loaded, options.load, options.name), agent.net.n_rules
-        print(f"{new}: {plural(rules, 'rule')} from {options.load}, the rest from {path}")
+        made, rules = edited(options.run, loaded, options.load, options.name), agent.net.n_rules
+        print(f"{made}: {plural(rules, 'rule')} from {options.load}, the rest from {path}")
         return
     print(learned(agent, path, state))
     reading = words.read(agent)
@@ -220,6 +222,8 @@ def run(options: Options) -> None:
 
 def main() -> None:
     """Entry point of ``python -m sofnn_torch.rules``."""
+    if new.is_asked(sys.argv[1:]):
+        sys.exit(attempt(lambda: new.begin(sys.argv[1:])))
     command(run, Options, __doc__)
 
 

@@ -4,8 +4,6 @@ import json
 import shutil
 from pathlib import Path
 
-import torch
-
 from sofnn_torch.evaluate import Loaded
 from sofnn_torch.rules import files
 from sofnn_torch.runs import checkpoint
@@ -28,8 +26,7 @@ def edited(source: Path, loaded: Loaded, file: Path, name: str | None = None) ->
             is left behind then.
     """
     config, agent, path, state = loaded
-    rules = torch.from_numpy(files.read(file, files.schema(agent)))
-    agent.net.replace_rules(*rules.split_with_sizes(agent.net.parts, 1))
+    files.put(agent, files.read(file, files.schema(agent)))
     # The best and the last ten trials were those of other rules.
     state = state | {"network": checkpoint.describe(agent.net), "recent": [], "best": []}
     state["agent"] = state["agent"] | {"net": agent.net.state_dict()}

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from sofnn_torch.learners.learner import Learner
@@ -84,7 +85,8 @@ def schema(agent: Learner) -> Schema:
     low[n : 2 * n] = net.min_width
     for row, output in enumerate(agent.outputs, 2 * n):
         low[row], high[row] = max(low[row], output.low), min(high[row], output.high)
-    counts = (net.n_rules, net.n_rules) if not net.criterion.grows else (1, net.max_rules)
+    fixed = not net.criterion.grows and net.n_rules > 0
+    counts = (net.n_rules, net.n_rules) if fixed else (1, net.max_rules)
     inputs = tuple((axis.name, axis.unit) for axis in agent.inputs)
     outputs = tuple(output.name.replace(" ", "_") for output in agent.outputs)
     return Schema(agent.name, inputs, outputs, low, high, counts)
@@ -137,18 +139,35 @@ def read(path: Path, kind: Schema) -> NDArray[Any]:
         ValueError: one line that names the file, and the rule and the number where one is wrong.
     """
     try:
-        suffix = path.suffix.lower()
-        if suffix not in SUFFIXES:
-            raise ValueError("a rule file ends in .json or .csv")
-        text = _text(path, kind.most_bytes)
-        if suffix == ".json":
-            return _checked(_from_json(text, kind), kind)
-        return _checked(sheets.numbers(text, kind.columns, kind.counts[1]), kind)
+        return parse(text(path, kind.most_bytes), kind, path.suffix.lower() == ".json")
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
 
 
-def _text(path: Path, most: int) -> str:
+def parse(text: str, kind: Schema, is_json: bool) -> NDArray[Any]:
+    """The rules in the text of a file, one in each row. Shape: (K, 2n+m).
+
+    Raises:
+        ValueError: one line on what is wrong, with the rule and the number.
+    """
+    if is_json:
+        return _checked(_from_json(text, kind), kind)
+    return _checked(sheets.numbers(text, kind.columns, kind.counts[1]), kind)
+
+
+def put(agent: Learner, table: NDArray[Any]) -> None:
+    """Give a learner the rules of a table (K, 2n+m) in the place of all."""
+    agent.net.replace_rules(*torch.from_numpy(table).split_with_sizes(agent.net.parts, 1))
+
+
+def text(path: Path, most: int) -> str:
+    """The text of a rule file; its name ends in .json or .csv.
+
+    Raises:
+        ValueError: it cannot be read, is no text or has more bytes than `most`.
+    """
+    if path.suffix.lower() not in SUFFIXES:
+        raise ValueError("a rule file ends in .json or .csv")
     try:
         if not path.is_file():
             raise ValueError("no such file")

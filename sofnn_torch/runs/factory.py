@@ -10,6 +10,7 @@ from sofnn_torch.maze.plan import MazePlan
 from sofnn_torch.maze.robot import plan_of
 from sofnn_torch.network.settings import NetworkConfig
 from sofnn_torch.network.sofnn import SOFNN, grid
+from sofnn_torch.rules import files
 from sofnn_torch.runs.settings import MAZE, Config
 from sofnn_torch.tasks.env import TaskEnv, make
 
@@ -38,8 +39,8 @@ def make_plan(config: Config) -> MazePlan:
 
 
 def make_agent(config: Config) -> Learner:
-    """The learner and its network that the settings describe, with no rule learned yet."""
-    return assemble(
+    """The learner and its network that the settings describe, before the first trial."""
+    agent = assemble(
         config.learner,
         config.task,
         config.learner_settings,
@@ -49,6 +50,27 @@ def make_agent(config: Config) -> Learner:
         config.seed,
         least=1e-3 if config.env == MAZE else least_width(config.widths),
     )
+    if config.rules:
+        _give_rules(agent, config)
+    return agent
+
+
+def _give_rules(agent: Learner, config: Config) -> None:
+    """Let a learner begin with the rules of its settings, and new rules with what these conclude.
+
+    Raises:
+        ValueError: rules that this learner cannot have.
+    """
+    net, is_json = agent.net, config.rules.lstrip().startswith("{")
+    try:
+        table = files.parse(config.rules, files.schema(agent), is_json)
+    except ValueError as error:
+        raise ValueError(f"--rules: {error}") from None
+    files.put(agent, table)
+    net.given, net.given_rate = len(table), config.rules_rate
+    # A rule with neutral consequents would take its place from the rules around it.
+    net.interpolate.fill_(True)
+    net.interpolates = True
 
 
 def least_width(widths: Sequence[float]) -> float:

@@ -5,6 +5,7 @@ which makes one ``default`` serve all of them.
 """
 
 import math
+from dataclasses import replace
 from typing import Any
 
 from sofnn_torch.learners.qlearning import QConfig
@@ -53,6 +54,21 @@ def task_tables(agent: str, network: str, found: Spaces) -> dict[str, Any]:
         replays=20,
     )
     return {"net": net, "sga": sga, "q": q, "maze": MazeConfig()}
+
+
+def careful(tables: dict[str, Any]) -> dict[str, Any]:
+    """The tables of a preset for a run that begins with a few wide rules, which know the way.
+
+    A narrow rule among them is a plateau in what they say together, on which a robot may be caught:
+    one is made only where none of them fires at all. Replay, before the values are learned, learns
+    that whatever was done was wrong.
+    """
+    changes: dict[str, dict[str, Any]] = {
+        "net": {"theta": 0.001},
+        "sga": {"replays": 0, "rate_value": 0.3},
+        "q": {"replays": 0},
+    }
+    return tables | {name: replace(tables[name], **part) for name, part in changes.items()}
 
 
 def _default(agent: str, network: str) -> dict[str, Any]:

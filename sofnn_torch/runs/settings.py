@@ -17,7 +17,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import tyro
 
-from sofnn_torch.bounds import Positive, Settings, Within, flag, read
+from sofnn_torch.bounds import NotNegative, Positive, Settings, Within, flag, read
 from sofnn_torch.learners import learner_class
 from sofnn_torch.learners.learner import Learner, Task
 from sofnn_torch.learners.qlearning import QConfig
@@ -26,14 +26,16 @@ from sofnn_torch.maze.settings import MazeConfig
 from sofnn_torch.maze.spaces import ACTION_NAMES, wheel_speeds
 from sofnn_torch.network.axes import Axis, named
 from sofnn_torch.network.settings import NetworkConfig
+from sofnn_torch.rules import files
 from sofnn_torch.runs import presets
 from sofnn_torch.tasks.env import look
 from sofnn_torch.tasks.survey import survey
 
 PRESET: Any = None  # as a default: the value of the preset
 MAZE = "maze"
-BASIC = ("env", "agent", "network", "preset", "seed")  # the preset of all others depends on them
 PATIENCE = 15  # decisions in the maze without a new state, after which a policy circles
+BASIC = ("env", "agent", "network", "preset", "seed", "rules")  # on them all others depend
+LARGEST_RULES = 2**19  # bytes; they are kept in config.json and in every checkpoint
 Input = tuple[str, str, float, float, float]
 
 
@@ -66,6 +68,11 @@ class Config(Settings):
     """Seed of every random number of the run."""
     trials: Annotated[int, Within(above=0)] = 200
     """Trials to learn for."""
+    rules: Annotated[str, tyro.conf.arg(metavar="FILE")] = ""
+    """Begin with the rules in this .json or .csv file, which are kept with the run; new rules then
+    begin with what these conclude where they are made (docs/rules.md)."""
+    rules_rate: NotNegative = 0.01
+    """Factor of the learning rates of the rules that `--rules` gave; 0 keeps them as they are."""
     net: NetworkConfig = PRESET
     sga: SGAConfig = PRESET
     q: QConfig = PRESET
@@ -84,6 +91,10 @@ class Config(Settings):
         """Take what is not given from the preset; ValueError names the flag and what is allowed."""
         if isinstance(self.own, Mapping):
             object.__setattr__(self, "own", tuple(self.own.items()))
+        if isinstance(self.rules, Path):
+            object.__setattr__(self, "rules", str(self.rules))
+        if isinstance(self.rules, str) and self.rules and "\n" not in self.rules:
+            object.__setattr__(self, "rules", _text(Path(self.rules)))
         for name, value in self._preset().items():
             given = getattr(self, name)
             if given is PRESET or (name == "axes" and len(given) == 0):
@@ -138,6 +149,8 @@ class Config(Settings):
         if used in tables:
             idle |= {f"{used}.{name}": why for name, why in self.learner_settings.idle().items()}
             idle["own"] = f"with --agent {self.agent}"
+        if not self.rules:
+            idle["rules_rate"] = "without --rules"
         if self.task.discrete:
             idle["q.segments"] = "with --maze.actions three" if self.env == MAZE else elsewhere
         fixed, acting = self.network == "fixed", self._acting
@@ -173,7 +186,8 @@ class Config(Settings):
         """The values of what is not given."""
         agent, seed = str(self.agent), self.seed if np.issubdtype(type(self.seed), int) else 0
         if self.env == MAZE or not isinstance(self.env, str):
-            return presets.tables(agent, self.network, self.preset) | {"reward_scale": 1.0}
+            tables = presets.tables(agent, self.network, self.preset)
+            return (presets.careful(tables) if self.rules else tables) | {"reward_scale": 1.0}
         if self.preset == "paper":
             raise ValueError("--preset paper is for --env maze")
         try:
@@ -185,6 +199,7 @@ class Config(Settings):
         except ValueError as error:
             raise ValueError(f"--env {error}") from None
         tables = presets.task_tables(agent, self.network, found)
+        tables = presets.careful(tables) if self.rules else tables
         axes = tuple((a.name, a.unit, a.low, a.high, a.period) for a in found.axes)
         return tables | {"axes": axes, "reward_scale": found.reward_scale}
 
@@ -227,6 +242,18 @@ class Config(Settings):
             raise ValueError(
                 f"--net.grid {shape} has more rules than --net.max-rules {self.net.max_rules}"
             )
+
+
+def _text(path: Path) -> str:
+    """The text of a rule file, of several lines as a path never is.
+
+    Raises:
+        ValueError: naming the flag.
+    """
+    try:
+        return files.text(path, LARGEST_RULES).rstrip("\n") + "\n"
+    except ValueError as error:
+        raise ValueError(f"--rules {path}: {error}") from None
 
 
 def from_dict(data: Any) -> Config:
