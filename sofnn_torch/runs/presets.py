@@ -60,11 +60,11 @@ def careful(tables: dict[str, Any]) -> dict[str, Any]:
     """The tables of a preset for a run that begins with a few wide rules, which know the way.
 
     A narrow rule among them is a plateau in what they say together, on which a robot may be caught:
-    one is made only where none of them fires at all. Replay, before the values are learned, learns
-    that whatever was done was wrong.
+    none is added. Replay, before the values are learned, learns that whatever was done was wrong. A
+    rule that fires alone for a whole trial needs rate_value < 2 (1 - gamma lambda).
     """
     changes: dict[str, dict[str, Any]] = {
-        "net": {"theta": 0.001},
+        "net": {"growth": "frozen"},
         "sga": {"replays": 0, "rate_value": 0.3},
         "q": {"replays": 0},
     }
