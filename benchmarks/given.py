@@ -1,7 +1,7 @@
 """Trials to learn with ten rules by hand, against a start from nothing.
 
 Each arm is trained with the presets (`train.py`, and `train.py --rules examples/rules/AGENT.csv`)
-until it has learned: ten trials in a row under 1.5 times the shortest way, the last of which counts.
+until it has learned: ten trials in a row under 1.5 times the shortest way; the last of them counts.
 With rules it goes on to the last trial, so that what is lost later shows too. Shown are the steps
 of the first trial, the most steps in trials 2 to 10, the median trial at which it had learned, and,
 with rules, the steps in the last ten trials and how many trials were longer than 1.5 times the

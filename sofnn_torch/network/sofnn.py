@@ -309,9 +309,11 @@ class SOFNN(RuleTable):
         """Put these rules in the place of all: see `RuleTable.replace_rules`.
 
         Raises:
-            ValueError: also if a frozen structure would get another number of rules.
+            ValueError: also if a frozen structure would get another number of rules, unless it
+                was given by rules itself.
         """
-        if not self.criterion.grows and self.n_rules not in (0, len(centres)):
+        frozen = not self.criterion.grows and not self.given
+        if frozen and self.n_rules not in (0, len(centres)):
             raise ValueError(
                 f"a frozen structure keeps its {self.n_rules} rules, got {len(centres)}"
             )

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -78,7 +79,12 @@ def _around(
     for k in rules:
         (u, v, angle, *_), (a, b, *_) = agent.net.centres[k].tolist(), agent.net.widths[k].tolist()
         colour, line = (BLUE, "-") if values[k] > 0 else (VERMILION, "--")
-        style = {"fill": False, "edgecolor": colour, "linestyle": line, "linewidth": 1.2}
+        style: dict[str, Any] = {
+            "fill": False,
+            "edgecolor": colour,
+            "linestyle": line,
+            "linewidth": 1.2,
+        }
         ax.add_patch(Ellipse((u, v), 2 * a, 2 * b, zorder=5, **style))
         ends = [u, u + 0.03 * math.cos(angle)], [v, v + 0.03 * math.sin(angle)]
         ax.plot(*ends, color=colour, linewidth=1.6, zorder=6)

@@ -2,6 +2,8 @@
 
     python -m sofnn_torch.rules RUN                        # the rules that matter most, a table
     python -m sofnn_torch.rules RUN --at 0.15 0.15 90      # who decides at a pose: m, m, degrees
+    python -m sofnn_torch.rules RUN --why 0.15 0.15 90     # why it does what it does there
+    python -m sofnn_torch.rules RUN --check                # what is doubtful in them
     python -m sofnn_torch.rules RUN --within 0.1 0.2 0.1 0.2 60 120   # what it can do in a region
     python -m sofnn_torch.rules RUN --json rules.json --csv rules.csv --picture rules.png
     python -m sofnn_torch.rules RUN --load rules.json      # edited rules become a new run
@@ -10,6 +12,7 @@
 The run directory is not changed. docs/rules.md says how to read a rule and what a file holds.
 """
 
+import itertools
 import math
 import signal
 import sys
@@ -24,20 +27,19 @@ import numpy as np
 import tyro
 from numpy.typing import NDArray
 
-from sofnn_torch.bounds import Settings, Within
+from sofnn_torch.bounds import Count, Settings, Within
 from sofnn_torch.evaluate import learned, load
 from sofnn_torch.learners.learner import Learner
-from sofnn_torch.pictures import figures
-from sofnn_torch.rules import files, new, tables, words
+from sofnn_torch.pictures import figures, spots
+from sofnn_torch.rules import checks, files, new, played, tables, why, words
 from sofnn_torch.rules.editing import edited
 from sofnn_torch.rules.regions import actions_within
 from sofnn_torch.rules.words import Reading
-from sofnn_torch.runs import checkpoint, seeding
-from sofnn_torch.runs.factory import make_env, make_plan
+from sofnn_torch.runs import checkpoint
+from sofnn_torch.runs.factory import make_plan
 from sofnn_torch.runs.session import RunOptions, arithmetic
 from sofnn_torch.runs.settings import MAZE, Config
 from sofnn_torch.terminal import attempt, check_output, command, plural, say
-from sofnn_torch.training import play
 
 PICTURES = (".png", ".svg", ".pdf")
 
@@ -53,6 +55,19 @@ class Options(Settings):
     at: tuple[float, ...] | None = None
     """Show which rules decide at a state instead: in the maze x and y in metres and the heading in
     degrees, in another task its inputs in their order and units."""
+    why: tuple[float, ...] | None = None
+    """Say in a sentence why the policy does what it does at a state, in the units of --at;
+    --picture draws the spot."""
+    why_trial: Count | None = None
+    """Say so of a decision in the trial of this number that `evaluate` plays with the same --seed;
+    of trials of the training only the numbers in trials.csv are kept."""
+    decision: Count | None = None
+    """Number of the decision (with --why-trial)."""
+    path: Path | None = None
+    """Write every decision of that trial, or else of the first, to this .csv file."""
+    check: bool = False
+    """Look for contradictions, rules that are outvoted, idle or inside walls, and gaps on the
+    way."""
     within: tuple[float, ...] | None = None
     """Show instead which actions the policy can take anywhere in a region, proved or with an
     example: the lower and the upper end of each input, in the units of --at."""
@@ -67,7 +82,7 @@ class Options(Settings):
     name: str | None = None
     """Name of the new run; by default that of the old one with `-edited`."""
     seed: Annotated[int, Within(least=0)] = 1000
-    """Seed of the trial that shows how much each rule is used."""
+    """Seed of the trials: that which shows how much each rule is used, and those of --why-trial."""
 
 
 def check(options: Options) -> None:
@@ -76,8 +91,10 @@ def check(options: Options) -> None:
     Raises:
         ValueError: naming the flag.
     """
-    if options.at and not all(abs(value) < 1e6 for value in options.at):
-        raise ValueError(f"--at must be a state in the units of its inputs, got {options.at}")
+    for name in ("at", "why"):
+        values = getattr(options, name)
+        if values and not all(abs(value) < 1e6 for value in values):
+            raise ValueError(f"--{name} must be a state in the units of its inputs, got {values}")
     if options.within and not all(abs(value) < 1e6 for value in options.within):
         raise ValueError(f"--within needs ends in the units of its inputs, got {options.within}")
     if options.name is not None and not options.load:
@@ -86,28 +103,66 @@ def check(options: Options) -> None:
     outputs = {name: getattr(options, name) for name in ("json", "csv", "picture")}
     for name, path in outputs.items():
         check_output(f"--{name}", path, PICTURES if name == "picture" else (f".{name}",))
-    given = [f"--{name}" for name in ("load", "at", "within", *outputs) if getattr(options, name)]
-    if len(given) > 1 and (options.load or options.at or options.within):
-        raise ValueError(f"{given[0]} and {given[1]} do not go together: use two commands")
+    check_output("--path", options.path, (".csv",))
+    if (options.why_trial is None) != (options.decision is None) and not options.path:
+        raise ValueError("--why-trial and --decision go together")
+    if options.decision and not options.why_trial:
+        raise ValueError("--decision needs --why-trial")
+    alone = ("load", "at", "why", "within", "check", "path", "why_trial")
+    given = [name for name in (*alone, *outputs) if getattr(options, name)]
+    pairs = ({"why", "picture"}, {"why_trial", "picture"}, {"path", "why_trial"})
+    if len(given) > 1 and set(given) & set(alone) and set(given) not in pairs:
+        a, b = (f"--{name}".replace("_", "-") for name in given[:2])
+        raise ValueError(f"{a} and {b} do not go together: use two commands")
 
 
 def firing_along_a_trial(
     config: Config, agent: Learner, seed: int
 ) -> tuple[NDArray[Any], int, str]:
     """Share of each rule (K,) in a trial without learning, its decisions, and how it went."""
-    env = make_env(config)
-    try:
-        seeding.begin(env, agent, seed)
-        record, path = play(env, agent, learn=False, explore=False)
-    finally:
-        env.close()
-    outcome = f"{'goal' if record.success else 'no goal'} after {record.steps:,} steps"
-    if record.success is None:
-        outcome = f"return {record.reward:,.4g} in {record.steps:,} steps"
-    return agent.usage(path.decided_at(config.pose)), record.decisions, outcome
+    trial = played.trial(config, agent, 1, seed)
+    return agent.usage(trial.states), trial.record.decisions, played.outcome(trial.record)
 
 
-def state_of(options: Options, config: Config) -> NDArray[np.float32]:
+def explain(options: Options, config: Config, agent: Learner) -> None:
+    """Say why the policy does what it does at a state or did in a trial; write what is asked for.
+
+    Raises:
+        ValueError: there is no such decision, or rules have no vote.
+        OSError: a file cannot be written.
+    """
+    plan = make_plan(config) if config.env == MAZE else None
+    if options.why:
+        state = state_of(options.why, "--why", config)
+    else:
+        number = options.why_trial or 1
+        trial = played.trial(config, agent, number, options.seed)
+        end = f"{played.outcome(trial.record)}, {plural(trial.record.decisions, 'decision')}"
+        print(f"trial {number} of evaluate --seed {options.seed}, without learning: {end}")
+        if options.path:
+            checkpoint.write_atomically(options.path, played.to_csv(agent, trial))
+            print(f"written: {options.path}")
+        if not options.decision:
+            return
+        state = played.asked(trial, options.decision)
+    place = ", ".join(map(words.at, config.task.axes, state.tolist()))
+    print(f"at {place}:")
+    reason = why.reason(agent, state)
+    if options.decision and played.chance(trial, agent, options.decision):
+        print(f"the policy took chance here to leave a circle, and did not do {reason.action};")
+        print("without chance it would have:")
+    print(why.sentence(agent, reason, plan))
+    tables.show(why.table(agent, reason))
+    print(why.threshold(reason))
+    if options.picture:
+        shown = [*itertools.chain(*reason.deciding())]
+        figure = spots.spot(agent, state, shown, reason.values, f"{place}: {reason.action}", plan)
+        data = figures.saved(figure, options.picture.suffix[1:])
+        checkpoint.write_atomically(options.picture, data)
+        print(f"written: {options.picture}")
+
+
+def state_of(given: tuple[float, ...], flag: str, config: Config) -> NDArray[np.float32]:
     """The state (n,) that was asked for.
 
     Where it is out of range this warns, and no more: the rules answer everywhere.
@@ -115,21 +170,21 @@ def state_of(options: Options, config: Config) -> NDArray[np.float32]:
     Raises:
         ValueError: it has another number of inputs.
     """
-    axes, values = config.task.axes, list(options.at or ())
+    axes, values = config.task.axes, list(given)
     if len(values) != len(axes):
         names = ", ".join(axis.name for axis in axes)
-        raise ValueError(f"--at needs {len(axes)} numbers ({names}), got {len(values)}")
+        raise ValueError(f"{flag} needs {len(axes)} numbers ({names}), got {len(values)}")
     if config.env == MAZE:
         width, height = make_plan(config).size
         x, y, degrees = values[:3]
         if not (0 <= x <= width and 0 <= y <= height):
-            say(f"warning: --at {x:g} {y:g} is outside the maze of {width:g} x {height:g} m")
+            say(f"warning: {flag} {x:g} {y:g} is outside the maze of {width:g} x {height:g} m")
         values[2] = math.remainder(math.radians(degrees), 2 * math.pi)
     else:
         for axis, value in zip(axes, values, strict=True):
             if not (axis.period or axis.low <= value <= axis.high):
                 ends = f"{axis.low:g} to {axis.high:g}"
-                say(f"warning: --at {axis.name} {value:g} is out of its range, {ends}")
+                say(f"warning: {flag} {axis.name} {value:g} is out of its range, {ends}")
     return np.array(values, np.float32)
 
 
@@ -186,16 +241,25 @@ def run(options: Options) -> None:
     check(options)
     loaded = load(options.run)
     config, agent, path, state = loaded
-    if options.picture and config.env != MAZE:
+    if options.picture and config.env != MAZE and not (options.why or options.why_trial):
         raise ValueError(f"--picture is for the maze, not for --env {config.env}")
     if options.load:
         made, rules = edited(options.run, loaded, options.load, options.name), agent.net.n_rules
         print(f"{made}: {plural(rules, 'rule')} from {options.load}, the rest from {path}")
         return
     print(learned(agent, path, state))
+    if options.why or options.why_trial or options.path:
+        explain(options, config, agent)
+        return
+    if options.check:
+        trial = played.trial(config, agent, 1, options.seed)
+        print(f"one trial without learning, seed {options.seed}: {played.outcome(trial.record)}")
+        plan = make_plan(config) if config.env == MAZE else None
+        print(checks.report(checks.findings(agent, trial.states, plan)))
+        return
     reading = words.read(agent)
     if options.at:
-        asked = state_of(options, config)
+        asked = state_of(options.at, "--at", config)
         decision = words.decide(agent, asked)
         place = map(words.at, config.task.axes, asked.tolist())
         print(f"at {', '.join(place)}:")

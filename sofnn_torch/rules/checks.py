@@ -78,7 +78,9 @@ def contradictions(agent: Learner, votes: Array, most: int) -> Finding:
         i, j = np.nonzero(np.triu(apart & (meeting >= OVERLAP), 1))
         count += len(i)
         best = np.argsort(-meeting[i, j], kind="stable")[:most]
-        worst += [(meeting[a, b], a + start, b + start) for a, b in zip(i[best], j[best])]
+        worst += [
+            (meeting[a, b], a + start, b + start) for a, b in zip(i[best], j[best], strict=True)
+        ]
     said = [
         f"rule {a + 1} ({said_by(agent, votes[a])}) against rule {b + 1} "
         f"({said_by(agent, votes[b])}): both fire by {strength:.2f} between them"

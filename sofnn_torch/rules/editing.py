@@ -1,5 +1,6 @@
 """Rules from a file in the place of those that a run has learned."""
 
+import dataclasses
 import json
 import shutil
 from pathlib import Path
@@ -26,7 +27,13 @@ def edited(source: Path, loaded: Loaded, file: Path, name: str | None = None) ->
             is left behind then.
     """
     config, agent, path, state = loaded
-    files.put(agent, files.read(file, files.schema(agent)))
+    kind = files.schema(agent)
+    table = files.read(file, kind)
+    files.put(agent, table)
+    if config.rules:  # the rules that learn at the rates of given ones are now these
+        agent.net.given = len(table)
+        config = dataclasses.replace(config, rules=files.to_csv(kind, table, {}).decode())
+        state = state | {"config": dataclasses.asdict(config)}
     # The best and the last ten trials were those of other rules.
     state = state | {"network": checkpoint.describe(agent.net), "recent": [], "best": []}
     state["agent"] = state["agent"] | {"net": agent.net.state_dict()}

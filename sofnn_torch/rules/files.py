@@ -85,7 +85,7 @@ def schema(agent: Learner) -> Schema:
     low[n : 2 * n] = net.min_width
     for row, output in enumerate(agent.outputs, 2 * n):
         low[row], high[row] = max(low[row], output.low), min(high[row], output.high)
-    fixed = not net.criterion.grows and net.n_rules > 0
+    fixed = not net.criterion.grows and net.n_rules > 0 and not net.given
     counts = (net.n_rules, net.n_rules) if fixed else (1, net.max_rules)
     inputs = tuple((axis.name, axis.unit) for axis in agent.inputs)
     outputs = tuple(output.name.replace(" ", "_") for output in agent.outputs)

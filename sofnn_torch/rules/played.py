@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from sofnn_torch.learners.learner import Learner
 from sofnn_torch.rules.checks import strengths
+from sofnn_torch.rules.files import shortest
 from sofnn_torch.runs import seeding
 from sofnn_torch.runs.factory import make_env
 from sofnn_torch.runs.settings import Config
@@ -87,14 +88,14 @@ def to_csv(agent: Learner, played: Played) -> bytes:
     true = [f"true_{name}" for name in ("x_m", "y_m", "heading_rad")] if knows else []
     last = ["action", "reward", "rule", "share", "firing"]
     lines.writerow(["decision", "steps", *true, *names, *last])
-    firing = strengths(agent, played.states)
+    firing, seen = strengths(agent, played.states), shortest(played.states).tolist()
     for t, state in enumerate(played.states):
         info = played.infos[t]
         share = agent.firing(state).double().numpy().mean(0)
         pose = info["true_pose"].tolist() if knows else []
         rule = int(share.argmax())
         lines.writerow(
-            [t + 1, info.get("total_steps", t), *pose, *map(float, state), tell(played.actions[t])]
+            [t + 1, info.get("total_steps", t), *pose, *seen[t], tell(played.actions[t])]
             + [played.rewards[t], rule + 1, f"{share[rule]:.6g}", f"{firing[t]:.6g}"]
         )
     return text.getvalue().encode()
@@ -117,6 +118,15 @@ def asked(played: Played, decision: int) -> NDArray[np.float32]:
         count = len(played.states)
         raise ValueError(f"--decision must be at most {count}, as many as the trial has")
     return played.states[decision - 1]
+
+
+def chance(played: Played, agent: Learner, decision: int) -> bool:
+    """Whether another action was taken at a decision, from 1, than the policy has without chance.
+
+    A policy that leaves circles takes chance at a rule that it does not get away from.
+    """
+    without = agent.plan(played.states[decision - 1][None]).actions[0]
+    return not np.allclose(without, played.actions[decision - 1], atol=1e-6)
 
 
 def outcome(record: TrialRecord) -> str:

@@ -69,13 +69,14 @@ def reason(agent: Learner, state: NDArray[np.float32]) -> Reason:
     Raises:
         ValueError: rules have no vote of their own: each is about one action.
     """
+    if len(agent.inputs) > len(agent.task.axes):
+        raise ValueError("--why needs rules that vote, not --q.coding antecedent: use --at")
     decision, plan = words.decide(agent, state), agent.plan(state[None])
     table = decision.conclusions
     if agent.choices:
         alone = agent.alone(table)
-        if alone is None:
-            raise ValueError("--why needs rules that vote, not --q.coding antecedent: use --at")
-        assert plan.choice is not None
+        if alone is None or plan.choice is None:
+            raise ValueError(f"--why does not know how --agent {agent.name} votes: use --at")
         values = _margins(agent, table, int(plan.choice[0]))
         said = [*agent.choices, "undecided"]  # the last for -1
         votes = [said[j] for j in alone.tolist()]
@@ -160,11 +161,11 @@ def table(agent: Learner, why: Reason) -> Table:
         "share",
         "votes for",
         "value",
-        "share × value",
+        "product",
         "IF",
         box=SIMPLE_HEAD,
         pad_edge=False,
-    )  # noqa: RUF001
+    )
     for column in (0, 1, 3, 4):
         view.columns[column].justify = "right"
     reading = words.read(agent)
@@ -185,8 +186,8 @@ def table(agent: Learner, why: Reason) -> Table:
         )
     rest = order[count:]
     if len(rest):
-        cells = [f"{why.weights[rest].sum():+.3f}", f"{len(rest):,} other rules"]
-        view.add_row("rest", f"{why.shares[rest].sum():.1%}", "", "", *cells)
+        sums = f"{why.shares[rest].sum():.1%}", f"{why.weights[rest].sum():+.3f}"
+        view.add_row("rest", sums[0], "", "", sums[1], f"{len(rest):,} other rules")
     view.add_section()
     view.add_row("all", "100%", why.action, "", f"{why.weights.sum():+.3f}", "")
     return view
