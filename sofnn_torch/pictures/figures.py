@@ -228,13 +228,14 @@ def memberships(agent: Learner, i: int, ax: Axes, names: Mapping[int, str]) -> N
             distance -= axis.period * np.round(distance / axis.period)
         curve = np.exp(-0.5 * (distance / agent.net.widths[rule, i].item()) ** 2)
         ax.plot(scale * x, curve, color=colour, linestyle=line, linewidth=1.4, label=name)
-    label = f"{axis.name} [{'degrees' if turns else axis.unit}]"
-    if not axis.unit:
+    unit, acting = "degrees" if turns else axis.unit, i >= len(agent.task.axes)
+    label = f"{axis.name} [{unit}]" if unit else axis.name
+    if acting:
         first, last = agent.task.actions[0], agent.task.actions[-1]
         label = f"{axis.name}: {first} (-1) to {last} (1)"
     limits = (scale * axis.low, scale * axis.high)
     ax.set(xlabel=label, xlim=limits, ylim=(0, 1.05), yticks=(0, 1))
-    ax.xaxis.set_major_locator(MultipleLocator(90 if turns else 0.2 if axis.unit else 0.5))
+    ax.xaxis.set_major_locator(MultipleLocator(90) if turns else MaxNLocator(6))
 
 
 @styled
