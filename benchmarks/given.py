@@ -78,6 +78,7 @@ def main() -> None:
                 plan = make_plan(config)
                 limit = WITHIN * mean_optimum(plan, config.maze.hold)
                 rows.append({"seed": seed} | learn(config, limit, arm == "nothing"))
+                print(f"{agent} from {arm}, seed {seed}:", *rows[-1]["steps"], flush=True)
             found[f"{agent} from {arm}"] = rows
             print(f"{agent} from {arm}: {summary(rows, options.trials, limit)}", flush=True)
             if options.out:
