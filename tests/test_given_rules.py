@@ -10,7 +10,6 @@ import torch
 from conftest import contents, parameters, quick_options, settings, written
 
 from sofnn_torch import SOFNN, cli, evaluate, training
-from sofnn_torch.learners import frozen
 from sofnn_torch.rules import files
 from sofnn_torch.runs import checkpoint
 from sofnn_torch.runs.directory import load_config
@@ -108,15 +107,6 @@ def test_a_new_rule_begins_with_what_all_say_there(agent):
     assert learner.net.add_rule(x)
     assert torch.allclose(learner.net(x[None]).detach(), before, atol=1e-4)
     assert torch.allclose(learner.net.consequents[-1], before[0], atol=1e-4)
-
-
-def test_wide_rules_are_allowed_more_decisions_before_chance_comes():
-    agent = make_agent(short())
-    wide = agent.net.default_width * torch.tensor([2.0, 0.5, 1.5])
-    agent.net.replace_rules(
-        torch.zeros(2, 3), torch.stack([agent.net.default_width, wide]), torch.zeros(2, 3)
-    )
-    assert frozen.patience(agent).tolist() == pytest.approx([4, 12])
 
 
 def test_edited_rules_become_the_given_ones(tmp_path, call):
