@@ -19,6 +19,7 @@ from conftest import quick_options, settings
 
 from sofnn_torch import cli, terminal, training
 from sofnn_torch.maze.rendering import RenderingError, choose_backend
+from sofnn_torch.rules import new
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -124,6 +125,9 @@ def test_the_flags_of_a_command_are_those_that_it_has(program, argv, place, monk
         if "sarsa:Sarsa" in argv:
             shutil.copy(ROOT / "tests" / "own.py", place / "sarsa.py")
         cli.parse(argv)
+        return
+    if new.is_asked(argv):  # takes the flags of train.py
+        cli.parse([word.replace(new.FLAG, "--rules") for word in argv])
         return
     folder = ROOT / program.replace(".", "/")
     module = importlib.import_module(f"{program}.__main__" if folder.is_dir() else program)
