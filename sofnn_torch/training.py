@@ -141,7 +141,9 @@ def play_again(path: Path | str) -> None:
     say(f"trial {state['trial'] + 1}: {learned}, no divergence")
 
 
-def _loop(session: Session, options: RunOptions, trap: SignalTrap, after: After | None) -> Path:
+def _loop(
+    session: Session, options: RunOptions, trap: SignalTrap, after: After | None = None
+) -> Path:
     """Trials until all are done; whatever ends the loop, the last whole trial is saved."""
     run, agent = session.run, session.agent
     monitor = Monitor(

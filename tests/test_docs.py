@@ -103,7 +103,10 @@ def place(tmp_path_factory):
     shutil.copy(run / "checkpoint-2.pt", run / "checkpoint-100.pt")
     for name in ("first", "left", "sixty", "few"):
         shutil.copytree(run, folder / "runs" / name)
-    (folder / "best.toml").write_text(dict(blocks(ROOT / "docs" / "scale.md"))["toml"])
+    text = next(text for kind, text in blocks(ROOT / "docs" / "scale.md") if kind == "toml")
+    for file in ("best.toml", "runs/sweep-q-sofnn-CartPole-v1/best.toml"):
+        (folder / file).parent.mkdir(exist_ok=True)
+        (folder / file).write_text(text)
     drawn = re.search(r"\n\n((?: {4}.*\n)+)", (ROOT / "docs" / "mazes.md").read_text())[1]
     (folder / "my_maze.txt").write_text(re.sub(r"(?m)^ {4}", "", drawn))
     (folder / "my_package.py").write_text(

@@ -5,6 +5,7 @@ import pytest
 
 from sofnn_torch import evaluate
 from sofnn_torch.rules import __main__ as rules
+from sofnn_torch.rules import played
 from sofnn_torch.runs import seeding
 from sofnn_torch.runs.factory import make_agent
 from sofnn_torch.runs.session import build
@@ -45,7 +46,7 @@ def test_trials_without_learning_have_three_streams_of_their_own(player, quick, 
     monkeypatch.setattr(robustness, "CONDITIONS", {"scatter": {1: {"start": 1.0}}})
     module, play = {
         "evaluate": (evaluate, lambda: evaluate.evaluate(config, make_agent(config), seed=SEED)),
-        "rules": (rules, lambda: rules.firing_along_a_trial(config, make_agent(config), SEED)),
+        "rules": (played, lambda: rules.firing_along_a_trial(config, make_agent(config), SEED)),
         "robustness": (robustness, lambda: robustness.under_conditions("run")),
     }[player]
     monkeypatch.setattr(module, "play", look)

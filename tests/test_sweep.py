@@ -64,7 +64,7 @@ def test_the_best_try_is_written_for_train_py_and_a_sweep_goes_on_as_if_never_st
     runs = [out / f"try-{best}-s{seed}" for seed in (0, 1)]
     loaded = [evaluate.load(run) for run in runs]
     assert [each.config for each in loaded] == [dataclasses.replace(config, seed=s) for s in (0, 1)]
-    line = next(line for line in said.splitlines() if line.startswith("best: train.py "))
+    *_, line = (line for line in said.splitlines() if line.startswith("best: train.py "))
     assert parse(line.split()[2:]).config == config
     returns = [
         record.reward
