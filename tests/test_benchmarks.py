@@ -19,6 +19,7 @@ from sofnn_torch.maze.settings import POSE
 from sofnn_torch.network.sofnn import SOFNN
 
 
+@pytest.mark.slow
 def test_training_is_measured_for_both_learners_and_both_physics(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(training, "SIZES", (30,))
     monkeypatch.setattr(training, "MAX_STEPS", 40)

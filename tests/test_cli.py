@@ -174,7 +174,9 @@ RATES = [f"sga.rate-{name}" for name in ("value", "centre", "width")]
 RATES += [f"q.rate-{name}" for name in ("state", "action", "constant", "centre", "width")]
 
 
-@pytest.mark.parametrize("rate", RATES)
+@pytest.mark.parametrize(
+    "rate", [pytest.param(r, marks=[pytest.mark.slow] * (i % 2)) for i, r in enumerate(RATES)]
+)
 def test_a_learning_rate_of_a_thousand_ends_in_a_message(rate, here, capsys):
     words = ["--agent", rate.partition(".")[0], f"--{rate}", "1e3", "--trials", "12", *QUICK]
     assert main([*words, "--maze.max-steps=2000"]) == 1

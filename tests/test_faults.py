@@ -555,6 +555,7 @@ def test_impossible_widths_are_refused(name, width, options):
     assert not options.runs.exists()
 
 
+@pytest.mark.slow
 def test_no_gl_at_all_is_one_warning(tmp_path):
     """A process whose GL library cannot be loaded trains and records without video."""
     command = [sys.executable, "train.py", "--runs", str(tmp_path), "--trials", "2", "--quiet"]

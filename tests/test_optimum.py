@@ -89,6 +89,7 @@ def test_the_held_optimum_does_not_depend_on_the_resolution(plan, held):
         assert optimal_steps(plan, 10, resolution).steps == held.steps
 
 
+@pytest.mark.slow
 def test_free_actions_are_faster(plan, held):
     assert optimal_steps(plan, 1, 0.0025).steps < 0.92 * held.steps
 

@@ -37,6 +37,7 @@ def compute(*arguments, **environment):
     ).stdout.split()
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not torch.cpu._is_avx2_supported(), reason="needs AVX2")
 def test_portable_bits_do_not_depend_on_the_instructions_and_others_do():
     one, other = {"ATEN_CPU_CAPABILITY": "default"}, {"MKL_CBWR": "AUTO"}
