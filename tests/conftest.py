@@ -10,8 +10,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from sofnn_torch import evaluate, training
 from sofnn_torch.rules import __main__ as rules
-from sofnn_torch.rules import files
-from sofnn_torch.runs import checkpoint
+from sofnn_torch.runs import checkpoint, rule_files
 from sofnn_torch.runs.settings import Config
 from sofnn_torch.training import RunOptions
 
@@ -83,9 +82,9 @@ def parameters(agent):
 
 def written(agent, path, table=None):
     """Write rules to a file: those of the learner if no others are given."""
-    write = files.to_json if path.suffix == ".json" else files.to_csv
+    write = rule_files.to_json if path.suffix == ".json" else rule_files.to_csv
     table = parameters(agent) if table is None else table
-    path.write_bytes(write(files.schema(agent), table, {"usage": [0.5] * len(table)}))
+    path.write_bytes(write(rule_files.schema(agent), table, {"usage": [0.5] * len(table)}))
     return path
 
 

@@ -14,7 +14,8 @@ from hypothesis import settings as trials_of
 from hypothesis import strategies as st
 
 from sofnn_torch.evaluate import Loaded
-from sofnn_torch.rules import editing, files
+from sofnn_torch.rules import editing
+from sofnn_torch.runs import rule_files
 
 STATE = np.float32([0.5, 0.5, 0.0])
 
@@ -128,19 +129,19 @@ def test_numbers_beyond_all_doubles_are_refused(few, tmp_path, number):
     file = written(few[1], tmp_path / "rules.json")
     file.write_text(file.read_text().replace("0.06", number, 1))
     with pytest.raises(ValueError, match=r"rule 1, width_x_m: must lie between 0.001 and 3, got"):
-        files.read(file, files.schema(few[1]))
+        rule_files.read(file, rule_files.schema(few[1]))
 
 
 def test_names_that_an_object_has_twice_are_refused(few, tmp_path):
     _, agent, *_ = few
     file = written(agent, tmp_path / "rules.json")
-    text, kind = file.read_text(), files.schema(agent)
+    text, kind = file.read_text(), rule_files.schema(agent)
     file.write_text(text.replace('"usage"', '"width": [1, 1, 1], "usage"', 1))
     with pytest.raises(ValueError, match=r'rules.json: rule 1: "width" is there twice'):
-        files.read(file, kind)
+        rule_files.read(file, kind)
     file.write_text(text.replace('"version"', '"agent": "sga", "version"', 1))
     with pytest.raises(ValueError, match=r'rules.json: "agent" is there twice'):
-        files.read(file, kind)
+        rule_files.read(file, kind)
 
 
 # ------------------------------------------------------------------------------------------ fuzz
@@ -245,7 +246,7 @@ def test_broken_files_load_whole_or_not_at_all(few, tmp_path, monkeypatch, suffi
     rule_file = tmp_path / f"rules{suffix}"
     text = written(agent, rule_file, parameters(agent)[:3]).read_text()
     before, outcomes = contents(path.parent), {"accepted": 0, "refused": 0}
-    agent, kind = copy.deepcopy(agent), files.schema(agent)
+    agent, kind = copy.deepcopy(agent), rule_files.schema(agent)
 
     def create(*_):
         raise Accepted

@@ -10,8 +10,7 @@ import torch
 from conftest import contents, parameters, quick_options, settings, written
 
 from sofnn_torch import SOFNN, cli, evaluate, training
-from sofnn_torch.rules import files
-from sofnn_torch.runs import checkpoint
+from sofnn_torch.runs import checkpoint, rule_files
 from sofnn_torch.runs.directory import load_config
 from sofnn_torch.runs.factory import make_agent
 from sofnn_torch.runs.settings import Config, from_dict
@@ -160,4 +159,4 @@ def test_a_fixed_structure_can_be_given_by_rules():
     config = settings(net={"growth": "frozen"})
     config = dataclasses.replace(config, rules=(RULES / "sga.csv").read_text())
     agent = make_agent(config)
-    assert agent.net.n_rules == 10 and files.schema(agent).counts == (1, 50_000)
+    assert agent.net.n_rules == 10 and rule_files.schema(agent).counts == (1, 50_000)

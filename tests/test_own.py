@@ -15,8 +15,8 @@ from conftest import quick_options
 from sofnn_torch import SOFNN, Config, NetworkConfig, load, resume, train
 from sofnn_torch.evaluate import evaluate
 from sofnn_torch.rules import __main__ as rules
-from sofnn_torch.rules import files, words
-from sofnn_torch.runs import checkpoint
+from sofnn_torch.rules import words
+from sofnn_torch.runs import checkpoint, rule_files
 
 OWN = "own:Sarsa"
 
@@ -58,7 +58,7 @@ def test_it_is_loaded_and_evaluated(run):
 def test_its_rules_are_words_files_and_a_picture(run, tmp_path, capsys):
     rules.run(rules.Options(run=run, csv=tmp_path / "r.csv", picture=tmp_path / "r.png"))
     agent = load(run).agent
-    table = files.read(tmp_path / "r.csv", files.schema(agent))
+    table = rule_files.read(tmp_path / "r.csv", rule_files.schema(agent))
     assert np.array_equal(table[:, -3:], agent.net.consequents.numpy())
     assert "Q_right_turn" in (tmp_path / "r.csv").read_text().splitlines()[0]
     best = agent.net.consequents[0].argmax()

@@ -10,6 +10,7 @@ import sysconfig
 import tomllib
 import venv
 import zipfile
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -143,6 +144,22 @@ def test_every_name_of_the_package_can_be_imported():
     assert set(sofnn_torch.__all__) <= set(dir(sofnn_torch))
     with pytest.raises(AttributeError, match="has no attribute 'SONFN'"):
         sofnn_torch.SONFN  # noqa: B018
+
+
+def test_the_folders_of_the_package_import_each_other_in_one_direction():
+    package = ROOT / "sofnn_torch"
+    folders = {path.name for path in package.iterdir() if (path / "__init__.py").exists()}
+    needs = {folder: set() for folder in folders}
+    for folder in folders:
+        for path in (package / folder).rglob("*.py"):
+            for node in ast.parse(path.read_text()).body:
+                if isinstance(node, ast.ImportFrom) and node.module.startswith("sofnn_torch"):
+                    names = [f"{node.module}.{alias.name}" for alias in node.names]
+                    needs[folder] |= {name.split(".")[1] for name in names} & folders - {folder}
+    assert needs["learners"] == {"network"}
+    assert list(
+        TopologicalSorter(needs).static_order()
+    )  # raises CycleError, which names the circle
 
 
 def test_the_network_and_the_learners_load_without_the_simulator():

@@ -13,16 +13,16 @@ from hypothesis import given
 from hypothesis import settings as trials_of
 from hypothesis import strategies as st
 
-from sofnn_torch.rules import files, sheets
+from sofnn_torch.runs import rule_files, sheets
 
 
 @pytest.fixture(scope="module")
 def sheet(few):
     """Cells of a rule file with comments, its table, and the schema."""
     agent = few[1]
-    kind, table = files.schema(agent), parameters(agent)[:6]
+    kind, table = rule_files.schema(agent), parameters(agent)[:6]
     comments = {"usage": [0.1] * 6, "text": ['about 150 ± 60 mm, "left"; 90°'] * 6}
-    rows = list(csv.reader(io.StringIO(files.to_csv(kind, table, comments).decode())))
+    rows = list(csv.reader(io.StringIO(rule_files.to_csv(kind, table, comments).decode())))
     return rows, table, kind
 
 
@@ -90,7 +90,7 @@ def test_a_table_that_a_spreadsheet_wrote_is_the_same_table(sheet, tmp_path, nam
     rows, table, kind = sheet
     text, file = SHEETS[name](rows), tmp_path / "Rules.CSV"
     file.write_bytes(text if isinstance(text, bytes) else text.encode())
-    assert files.read(file, kind).tobytes() == table.tobytes()
+    assert rule_files.read(file, kind).tobytes() == table.tobytes()
 
 
 CELLS = {
@@ -125,13 +125,13 @@ def test_only_plain_numbers_are_numbers(sheet, tmp_path, cell):
     (tmp_path / "rules.csv").write_text(dump(rows), encoding="utf-8")
     if expected is None:
         with pytest.raises(ValueError) as error:
-            files.read(tmp_path / "rules.csv", kind)
+            rule_files.read(tmp_path / "rules.csv", kind)
         hint = " (a decimal comma or a thousands separator?)" if "," in cell else ""
         assert str(error.value).endswith(
             f"rules.csv: rule 2, value: must be a number, got {json.dumps(cell.strip())}{hint}"
         )
     else:
-        found = files.read(tmp_path / "rules.csv", kind)
+        found = rule_files.read(tmp_path / "rules.csv", kind)
         assert found[1, kind.columns.index("value")] == np.float32(expected)
         table = np.delete(table, 1, 0)
         assert np.delete(found, 1, 0).tobytes() == table.tobytes()
@@ -183,7 +183,7 @@ def test_a_small_hostile_file_takes_little_memory(sheet, tmp_path, name):
     tracemalloc.start()
     try:
         with pytest.raises(ValueError) as error:
-            files.read(file, kind)
+            rule_files.read(file, kind)
         assert tracemalloc.get_traced_memory()[1] < 8 * LARGE
     finally:
         tracemalloc.stop()
@@ -235,7 +235,7 @@ def test_whatever_a_spreadsheet_saves_is_the_same_table_or_refused(sheet, tmp_pa
         data, slip = drawn
         file.write_bytes(data)
         try:
-            assert files.read(file, kind).tobytes() == table.tobytes()
+            assert rule_files.read(file, kind).tobytes() == table.tobytes()
             outcomes["same"] += 1
         except ValueError as error:
             assert slip and len(str(error).splitlines()) == 1 and len(str(error)) < 300

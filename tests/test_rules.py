@@ -18,8 +18,8 @@ from rich.console import Console
 from sofnn_torch import evaluate, training
 from sofnn_torch.network.sofnn import SOFNN
 from sofnn_torch.rules import __main__ as rules
-from sofnn_torch.rules import files, tables, words
-from sofnn_torch.runs import checkpoint
+from sofnn_torch.rules import tables, words
+from sofnn_torch.runs import checkpoint, rule_files
 from sofnn_torch.runs.directory import load_config
 from sofnn_torch.runs.factory import make_agent
 
@@ -73,8 +73,8 @@ STATES = np.random.default_rng(0).uniform([0, 0, -4], [1, 1, 4], (20, 3)).astype
 @pytest.mark.parametrize("suffix", [".json", ".csv"])
 def test_rules_come_back_bit_for_bit(trained, tmp_path, variant, suffix):
     _, agent, _, _ = evaluate.load(trained(variant))
-    kind, before = files.schema(agent), agent.net.table().detach().clone()
-    table = files.read(written(agent, tmp_path / f"rules{suffix}"), kind)
+    kind, before = rule_files.schema(agent), agent.net.table().detach().clone()
+    table = rule_files.read(written(agent, tmp_path / f"rules{suffix}"), kind)
     assert table.tobytes() == parameters(agent).tobytes()
     answers = [agent.act(state) for state in STATES]
     labels = agent.net.labels.clone()
@@ -88,9 +88,9 @@ def test_every_float_survives():
     bits = np.random.default_rng(1).integers(0, 2**32, 100_000, np.uint32)
     numbers = bits.view(np.float32)
     numbers = np.append(numbers[np.isfinite(numbers)], np.float32([0.0, -0.0, 0.1, 2**24 + 2]))
-    texts = list(map(repr, files.shortest(numbers).tolist()))
+    texts = list(map(repr, rule_files.shortest(numbers).tolist()))
     assert np.float32(list(map(float, texts))).tobytes() == numbers.tobytes()
-    assert files.shortest(np.float32([0.06, -0.45])).tolist() == [0.06, -0.45]
+    assert rule_files.shortest(np.float32([0.06, -0.45])).tolist() == [0.06, -0.45]
 
 
 def test_a_checkpoint_file_stands_for_its_run(run, tmp_path, call):

@@ -10,8 +10,8 @@ import numpy as np
 
 from sofnn_torch.export import fixed, templates
 from sofnn_torch.export.runtime import Policy
-from sofnn_torch.rules.files import shortest
 from sofnn_torch.runs.guard import LARGEST
+from sofnn_torch.runs.rule_files import shortest
 
 HEAD = re.compile(r"/\* sofnn-torch policy (\{.*\}) \*/")
 TABLE = re.compile(r"_rules\[[^\]]+\]\[[^\]]+\](?: \w+)? = \{(.*?)\n\};", re.DOTALL)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sofnn_torch.export.runtime import Policy
-from sofnn_torch.rules.files import shortest
+from sofnn_torch.runs.rule_files import shortest
 
 MOST_BYTES, MOST_RULES = 2**26, 100_000
 ANYWHERE = 1000.0  # ranges of an input: the width of a rule that does not ask for it

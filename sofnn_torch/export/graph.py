@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from sofnn_torch.export.runtime import FORMAT, Policy
-from sofnn_torch.rules.files import shortest
+from sofnn_torch.runs.rule_files import shortest
 
 OPSET, IR = 17, 8
 NEED = "an .onnx file needs the package onnx: pip install 'sofnn-torch[onnx]'"

@@ -12,8 +12,8 @@ from sofnn_torch.export import runtime
 from sofnn_torch.learners.frozen import MOST, nearness
 from sofnn_torch.learners.learner import Learner
 from sofnn_torch.maze.odometry import FORWARD_SPEED, STEP_SECONDS, TURN_SPEED, WHEEL_BASE
-from sofnn_torch.rules.files import shortest
 from sofnn_torch.runs.factory import make_plan, make_task
+from sofnn_torch.runs.rule_files import shortest
 from sofnn_torch.runs.settings import MAZE, Config
 
 RUNTIME = "sofnn_runtime.py"  # what the copy beside a policy is called

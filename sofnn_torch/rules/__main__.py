@@ -31,11 +31,11 @@ from sofnn_torch.bounds import Count, Settings, Within
 from sofnn_torch.evaluate import learned, load
 from sofnn_torch.learners.learner import Learner
 from sofnn_torch.pictures import figures, spots
-from sofnn_torch.rules import checks, files, new, played, tables, why, words
+from sofnn_torch.rules import checks, new, played, tables, why, words
 from sofnn_torch.rules.editing import edited
 from sofnn_torch.rules.regions import actions_within
 from sofnn_torch.rules.words import Reading
-from sofnn_torch.runs import checkpoint
+from sofnn_torch.runs import checkpoint, rule_files
 from sofnn_torch.runs.factory import make_plan
 from sofnn_torch.runs.session import RunOptions, arithmetic
 from sofnn_torch.runs.settings import MAZE, Config
@@ -215,15 +215,15 @@ def write(options: Options, config: Config, agent: Learner, reading: Reading, sh
     Raises:
         OSError: a file cannot be written.
     """
-    kind = files.schema(agent)
+    kind = rule_files.schema(agent)
     parameters = agent.net.table().detach().T.numpy()
     comments = {"usage": shares.tolist(), "outvoted": reading.outvoted.tolist()}
     comments["text"] = reading.sentences()
     if options.json:
-        data = files.to_json(kind, parameters, comments)
+        data = rule_files.to_json(kind, parameters, comments)
         checkpoint.write_atomically(options.json, data)
     if options.csv:
-        checkpoint.write_atomically(options.csv, files.to_csv(kind, parameters, comments))
+        checkpoint.write_atomically(options.csv, rule_files.to_csv(kind, parameters, comments))
     if options.picture:
         figure = figures.rules(make_plan(config), agent, shares, reading.brief())
         data = figures.saved(figure, options.picture.suffix[1:])

@@ -6,8 +6,7 @@ import shutil
 from pathlib import Path
 
 from sofnn_torch.evaluate import Loaded
-from sofnn_torch.rules import files
-from sofnn_torch.runs import checkpoint
+from sofnn_torch.runs import checkpoint, rule_files
 from sofnn_torch.runs.directory import Run
 from sofnn_torch.runs.places import numbered
 from sofnn_torch.runs.session import RunOptions, home_of
@@ -27,12 +26,12 @@ def edited(source: Path, loaded: Loaded, file: Path, name: str | None = None) ->
             is left behind then.
     """
     config, agent, path, state = loaded
-    kind = files.schema(agent)
-    table = files.read(file, kind)
-    files.put(agent, table)
+    kind = rule_files.schema(agent)
+    table = rule_files.read(file, kind)
+    rule_files.put(agent, table)
     if config.rules:  # the rules that learn at the rates of given ones are now these
         agent.net.given = len(table)
-        config = dataclasses.replace(config, rules=files.to_csv(kind, table, {}).decode())
+        config = dataclasses.replace(config, rules=rule_files.to_csv(kind, table, {}).decode())
         state = state | {"config": dataclasses.asdict(config)}
     # The best and the last ten trials were those of other rules.
     state = state | {"network": checkpoint.describe(agent.net), "recent": [], "best": []}

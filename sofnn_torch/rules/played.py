@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from sofnn_torch.learners.learner import Learner
 from sofnn_torch.rules.checks import strengths
-from sofnn_torch.rules.files import shortest
 from sofnn_torch.runs import seeding
 from sofnn_torch.runs.factory import make_env
+from sofnn_torch.runs.rule_files import shortest
 from sofnn_torch.runs.settings import Config
 from sofnn_torch.runs.trial import TrialRecord
 from sofnn_torch.training import play

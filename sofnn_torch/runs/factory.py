@@ -10,7 +10,7 @@ from sofnn_torch.maze.plan import MazePlan
 from sofnn_torch.maze.robot import plan_of
 from sofnn_torch.network.settings import NetworkConfig
 from sofnn_torch.network.sofnn import SOFNN, grid
-from sofnn_torch.rules import files
+from sofnn_torch.runs import rule_files
 from sofnn_torch.runs.settings import MAZE, Config
 from sofnn_torch.tasks.env import TaskEnv, make
 
@@ -63,10 +63,10 @@ def _give_rules(agent: Learner, config: Config) -> None:
     """
     net, is_json = agent.net, config.rules.lstrip().startswith("{")
     try:
-        table = files.parse(config.rules, files.schema(agent), is_json)
+        table = rule_files.parse(config.rules, rule_files.schema(agent), is_json)
     except ValueError as error:
         raise ValueError(f"--rules: {error}") from None
-    files.put(agent, table)
+    rule_files.put(agent, table)
     net.given, net.given_rate = len(table), config.rules_rate
     # A rule with neutral consequents would take its place from the rules around it.
     net.interpolate.fill_(True)

@@ -26,8 +26,7 @@ from sofnn_torch.maze.settings import MazeConfig
 from sofnn_torch.maze.spaces import ACTION_NAMES, wheel_speeds
 from sofnn_torch.network.axes import Axis, named
 from sofnn_torch.network.settings import NetworkConfig
-from sofnn_torch.rules import files
-from sofnn_torch.runs import presets
+from sofnn_torch.runs import presets, rule_files
 from sofnn_torch.tasks.env import look
 from sofnn_torch.tasks.survey import survey
 
@@ -251,7 +250,7 @@ def _text(path: Path) -> str:
         ValueError: naming the flag.
     """
     try:
-        return files.text(path, LARGEST_RULES).rstrip("\n") + "\n"
+        return rule_files.text(path, LARGEST_RULES).rstrip("\n") + "\n"
     except ValueError as error:
         raise ValueError(f"--rules {path}: {error}") from None
 

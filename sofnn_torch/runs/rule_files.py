@@ -18,9 +18,9 @@ import torch
 from numpy.typing import NDArray
 
 from sofnn_torch.learners.learner import Learner
-from sofnn_torch.rules import sheets
-from sofnn_torch.rules.sheets import show
+from sofnn_torch.runs import sheets
 from sofnn_torch.runs.guard import LARGEST, WIDEST, farthest
+from sofnn_torch.runs.sheets import show
 
 FORMAT, VERSION = "sofnn-torch rules", 1
 SUFFIXES = (".json", ".csv")
