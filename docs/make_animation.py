@@ -14,6 +14,7 @@ import tyro
 from matplotlib.axes import Axes
 from PIL import Image
 
+from sofnn_torch.learners.learner import Learner
 from sofnn_torch.maze.plan import MazePlan
 from sofnn_torch.pictures import figures
 from sofnn_torch.runs import checkpoint
@@ -54,6 +55,11 @@ def film(run: Path, trial: int) -> Filmed:
     config, path = saved_config(run), run / f"checkpoint-{trial - 1}.pt"
     agent, env = make_agent(config), make_env(config)
     checkpoint.restore(path, checkpoint.load(path), agent, env)
+    return watched(agent, env, trial)
+
+
+def watched(agent: Learner, env: Any, trial: int) -> Filmed:
+    """Learn a trial, and note it step by step."""
     filmed = Filmed(trial, env.plan)
 
     def note() -> None:

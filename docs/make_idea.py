@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from make_animation import watched
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
@@ -11,7 +12,6 @@ from sofnn_torch.pictures import figures
 from sofnn_torch.runs.session import arithmetic, build
 from sofnn_torch.runs.settings import Config
 from sofnn_torch.terminal import command
-from sofnn_torch.training import play
 
 OUT = Path(__file__).parent / "images"
 WIDTH = 0.06  # metres, of the membership functions on x and y
@@ -120,21 +120,11 @@ def roulette() -> Figure:
 @arithmetic()
 def growth() -> Figure:
     """Rules that the first trial of `train.py` adds."""
-    agent, env = build(Config())
-    steps: list[tuple[float, float]] = []
-    rules: list[int] = []
-
-    def note() -> None:
-        steps.append(env.physics.position())
-        rules.append(agent.net.n_rules)
-
-    env.on_simulator_step = note
-    play(env, agent)
-    env.close()
-    centres = agent.net.centres.numpy()[:, :2]
+    filmed = watched(*build(Config()), trial=1)
+    steps, rules, centres = filmed.places, filmed.rules, filmed.centres
     figure, axes = figures.canvas(4, 2.3, 2.7)
     for ax, step in zip(axes, (60, 600, 3000, len(steps)), strict=True):
-        figures.maze_plan(env.plan, ax, labels=False)
+        figures.maze_plan(filmed.plan, ax, labels=False)
         ax.set(xticks=[], yticks=[], xlabel=f"{rules[step - 1]} rules", ylabel="")
         ax.plot(*np.array(steps[:step]).T, color=figures.BLUE, linewidth=0.6, zorder=3)
         for centre in centres[: rules[step - 1]]:

@@ -23,7 +23,7 @@ from sofnn_torch.bounds import Count, Settings
 from sofnn_torch.runs import checkpoint, directory, parallel, preset_files
 from sofnn_torch.runs.guard import Divergence
 from sofnn_torch.runs.session import RunOptions, home_of, saved_config
-from sofnn_torch.runs.settings import BASIC, Config
+from sofnn_torch.runs.settings import BASIC, Config, why_idle
 from sofnn_torch.terminal import attempt, plural, program, quoted
 from sofnn_torch.terminal import parse as parse_flags
 
@@ -181,8 +181,7 @@ def _refuse_idle(flags: Flags, base: Flags) -> None:
         raise ValueError(f"{_flag(others[0])} has no effect with --again")
     idle = flags.config.idle() | ({} if flags.seeds is not None else {"workers": "without --seeds"})
     for name in _changes(flags, base):
-        why = idle.get(name) or idle.get(name.partition(".")[0])
-        if why:
+        if why := why_idle(idle, name):
             raise ValueError(f"{_flag(name)} has no effect {why}")
 
 

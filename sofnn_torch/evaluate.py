@@ -6,8 +6,8 @@
 
 By default the robot takes the mean action (SGA) or the greedy one (Q-learning); with --explore it
 samples its learned stochastic policy. A policy that has come to no new state for 15 decisions gains
-chance until it does, so that it leaves circles; --plain plays without that. Nothing is learned and
-the run directory is not changed.
+chance at the rules where it is, so that it leaves circles; --plain plays without that. Nothing is
+learned and the run directory is not changed.
 """
 
 import dataclasses
@@ -264,7 +264,7 @@ def table(rows: dict[str, Estimate]) -> Table:
     return view
 
 
-def plain(row: Estimate) -> dict[str, float | None]:
+def as_json(row: Estimate) -> dict[str, float | None]:
     """An estimate for JSON, which knows no NaN."""
     return {k: None if math.isnan(v) else v for k, v in dataclasses.asdict(row).items()}
 
@@ -331,7 +331,7 @@ def run(options: Options) -> dict[str, Estimate]:
             "plain": options.plain,
             "seed": options.seed,
             "confidence": CONFIDENCE,
-            "results": {name: plain(row) for name, row in rows.items()},
+            "results": {name: as_json(row) for name, row in rows.items()},
             "trials": [record.row() for record in records],
             "config": dataclasses.asdict(config),
             "versions": versions(),

@@ -92,7 +92,7 @@ def test_a_policy_that_never_arrives_still_gets_a_table(capsys):
     assert "nan" not in printed
     assert "500.0" in printed  # steps of all trials
     assert "mm" in printed
-    assert evaluate.plain(rows["steps_to_goal"]) == {"value": None, "low": None, "high": None}
+    assert evaluate.as_json(rows["steps_to_goal"]) == {"value": None, "low": None, "high": None}
 
 
 def test_the_table_is_in_the_units_that_it_names(capsys):

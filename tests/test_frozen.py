@@ -34,14 +34,19 @@ def contradiction():
     return agent
 
 
-def spy(agent, places):
-    """Record how much each decision at a series of places explores."""
+def watched(agent, places, **options):
+    """How much each decision at a series of places explores, and the policy afterwards."""
     explored, act = [], agent.act
     agent.act = lambda observation, explore: explored.append(explore) or act(observation, explore)
-    policy = FrozenPolicy(agent)
+    policy = FrozenPolicy(agent, **options)
     for place in places:
         policy.act(place)
-    return explored
+    return explored, policy
+
+
+def spy(agent, places):
+    """How much each decision at a series of places explores."""
+    return watched(agent, places)[0]
 
 
 def test_after_fifteen_decisions_without_a_new_state_the_chance_doubles_rule_by_rule():
@@ -72,20 +77,12 @@ def test_patience_needs_axes_with_ends():
 
 
 def test_a_plain_policy_has_no_cure():
-    agent = contradiction()
-    explored, agent.act = [], lambda observation, explore: explored.append(explore)
-    policy = FrozenPolicy(agent, plain=True)
-    for _ in range(40):
-        policy.act(EAST)
+    explored, policy = watched(contradiction(), [EAST] * 40, plain=True)
     assert explored == [0] * 40 and policy.freed == 0
 
 
 def test_the_stochastic_policy_begins_with_its_own_chance():
-    agent = contradiction()
-    explored, agent.act = [], lambda observation, explore: explored.append(explore)
-    policy = FrozenPolicy(agent, explore=True)
-    for _ in range(17):
-        policy.act(EAST)
+    explored, policy = watched(contradiction(), [EAST] * 17, explore=True)
     assert explored == [1] * 15 + [2, 4] and policy.freed == 2
 
 

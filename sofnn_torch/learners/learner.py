@@ -320,6 +320,13 @@ class Learner(ABC):
         """
         return None
 
+    def margins(self, conclusions: NDArray[np.float64], chosen: int) -> NDArray[np.float64]:
+        """How far each rule by its `conclusions` (K, c) is from another choice. Shape: (K,).
+
+        Above 0 a rule is for the chosen action: here by its value over that of the best other one.
+        """
+        return conclusions[:, chosen] - np.delete(conclusions, chosen, 1).max(1)
+
     def network_inputs(self, x: Tensor) -> Tensor:
         """Inputs of the network at states (.., n): these, or with every action (.., J, n + 1)."""
         return x

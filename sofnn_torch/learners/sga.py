@@ -187,6 +187,11 @@ class SGA(Learner):
         """The action that each mean stands for. Shape: (K,)."""
         return np.searchsorted(self.edges, conclusions[:, 0]) if self.choices else None
 
+    def margins(self, conclusions: NDArray[np.float64], chosen: int) -> NDArray[np.float64]:
+        """How far each mean is inside the part of the range of the chosen action. Shape: (K,)."""
+        ends = [-math.inf, *self.edges, math.inf]
+        return np.minimum(conclusions[:, 0] - ends[chosen], ends[chosen + 1] - conclusions[:, 0])
+
     def decoding(self) -> dict[str, Any]:
         """The first m outputs are means, the next m deviations; edges part discrete actions."""
         return {"kind": "normal", "numbers": self.m, "edges": self.edges if self.choices else None}

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from sofnn_torch.learners.learner import Learner
 from sofnn_torch.maze.plan import MazePlan
 from sofnn_torch.rules import words
+from sofnn_torch.rules.tables import FIRED
 
 OVERLAP = 0.6  # greatest firing strength at which two rules meet: that of a distance of two widths
 CHUNK = 256  # rules at a time, each beside all others
-IDLE = 0.01  # a rule with less firing in all of a trial took no part, as in docs/metrics.md
 Array = NDArray[Any]
 
 
@@ -140,15 +140,18 @@ def outvoted(agent: Learner, usage: Array, most: int) -> Finding:
     wrong = np.flatnonzero(reading.outvoted)
     worst = wrong[np.argsort(-usage[wrong], kind="stable")[:most]]
     brief = reading.brief()
-    together = agent.plan(agent.net.centres[:, : len(agent.task.axes)].numpy()).choice
+    together = agent.plan(agent.net.centres[worst, : len(agent.task.axes)].numpy()).choice
     assert together is not None  # there are choices
-    said = [f"rule {k + 1} ({brief[k]}): there all say {agent.choices[together[k]]}" for k in worst]
+    said = [
+        f"rule {k + 1} ({brief[k]}): there all say {agent.choices[j]}"
+        for k, j in zip(worst, together, strict=True)
+    ]
     return Finding("rules that are outvoted where they are centred", len(wrong), tuple(said))
 
 
 def unused(firing: Array, most: int) -> Finding:
     """Rules that take no part in a trial; firing is what each adds up to in it. Shape: (K,)."""
-    idle = np.flatnonzero(firing < IDLE)
+    idle = np.flatnonzero(firing < FIRED)
     worst = idle[np.argsort(firing[idle], kind="stable")[:most]]
     said = (f"rules {_listed(worst)}",) if len(worst) else ()
     return Finding("rules that take no part on the way", len(idle), said)

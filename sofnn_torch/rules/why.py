@@ -77,7 +77,7 @@ def reason(agent: Learner, state: NDArray[np.float32]) -> Reason:
         alone = agent.alone(table)
         if alone is None or plan.choice is None:
             raise ValueError(f"--why does not know how --agent {agent.name} votes: use --at")
-        values = _margins(agent, table, int(plan.choice[0]))
+        values = agent.margins(table, int(plan.choice[0]))
         said = [*agent.choices, "undecided"]  # the last for -1
         votes = [said[j] for j in alone.tolist()]
     else:
@@ -95,15 +95,6 @@ def reason(agent: Learner, state: NDArray[np.float32]) -> Reason:
         decision.strongest,
         agent.net.theta,
     )
-
-
-def _margins(agent: Learner, table: Array, chosen: int) -> Array:
-    """How far each rule by itself is from another choice than the chosen one. Shape: (K,)."""
-    edges = getattr(agent, "edges", None)
-    if agent.name == "sga" and edges is not None:
-        ends = np.array([-math.inf, *edges, math.inf])
-        return np.minimum(table[:, 0] - ends[chosen], ends[chosen + 1] - table[:, 0])
-    return table[:, chosen] - np.delete(table, chosen, 1).max(1)
 
 
 def sentence(agent: Learner, why: Reason, plan: MazePlan | None = None) -> str:
@@ -151,7 +142,7 @@ def nearest_wall(plan: MazePlan, x: float, y: float) -> tuple[float, float]:
 
 def compass(bearing: float) -> str:
     """A bearing [rad] in words; east is along x."""
-    return COMPASS[round(math.degrees(bearing) / 45) % 8]
+    return COMPASS[words.octant(bearing)]
 
 
 def table(agent: Learner, why: Reason) -> Table:

@@ -174,7 +174,12 @@ def bearing(heading: float, width: float | None = None) -> str:
     """A heading in radians as degrees and a direction, with a width in radians if there is one."""
     degrees = round(math.degrees(math.remainder(heading, 2 * math.pi)))
     spread = "" if width is None else f" ± {math.degrees(width):.0f}"
-    return f"{degrees}{spread}° {WINDS[round(degrees / 45) % 8]}"
+    return f"{degrees}{spread}° {WINDS[octant(heading)]}"
+
+
+def octant(heading: float) -> int:
+    """The nearest of eight directions to a heading in radians, counted from east to the left."""
+    return round(round(math.degrees(heading)) / 45) % 8
 
 
 def number(value: float, digits: int = 2) -> str:

@@ -25,7 +25,7 @@ import numpy as np
 
 from sofnn_torch.runs import checkpoint, presets
 from sofnn_torch.runs.directory import LARGEST_SETTINGS, flatten
-from sofnn_torch.runs.settings import BASIC, Config
+from sofnn_torch.runs.settings import BASIC, Config, why_idle
 
 KNOWN = flatten(dataclasses.asdict(Config()))
 
@@ -44,8 +44,9 @@ def from_file(path: Path | str, **changes: Any) -> Config:
     path, given = Path(path), read(path)
     try:
         config = make(given | changes)
+        idle = config.idle()
         for name in given:
-            if why := config.idle().get(name) or config.idle().get(name.partition(".")[0]):
+            if why := why_idle(idle, name):
                 raise ValueError(f"{name} has no effect {why}")
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None

@@ -37,6 +37,11 @@ class RunOptions(Settings):
         'first'
     """
 
+    @classmethod
+    def silent(cls, run: Path) -> "RunOptions":
+        """For a run in this directory of which nothing is shown and nothing drawn."""
+        return cls(runs=run.parent, name=run.name, picture_every=0, video_every=0, quiet=True)
+
     runs: Path = Path("runs")
     """Directory of all runs."""
     name: str | None = None

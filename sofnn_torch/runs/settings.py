@@ -243,6 +243,16 @@ class Config(Settings):
             )
 
 
+def why_idle(idle: Mapping[str, str], name: str) -> str | None:
+    """Why a setting changes nothing, itself or all of its table; None if it does.
+
+    Args:
+        idle: as `Config.idle` says.
+        name: of the setting, with that of its table.
+    """
+    return idle.get(name) or idle.get(name.partition(".")[0])
+
+
 def _text(path: Path) -> str:
     """The text of a rule file, of several lines as a path never is.
 

@@ -157,9 +157,7 @@ def work(directory: str, text: str, conditions: str = "") -> int:
 
 
 def _train_and_evaluate(path: Path, config: Config) -> dict[str, Any]:
-    options = training.RunOptions(
-        runs=path.parent, name=path.name, picture_every=0, video_every=0, quiet=True
-    )
+    options = training.RunOptions.silent(path)
     try:
         if (path / "config.json").exists():
             training.resume(path, options)

@@ -83,6 +83,7 @@ class Sweep:
     ranges: dict[str, Range]
     goal: tries.Goal
     seeds: list[int]
+    trials: int
     out: Path
 
     def config(self, values: dict[str, Any], seed: int = 0) -> Config:
@@ -106,7 +107,7 @@ def plan(options: Options) -> Sweep:
     goal = tries.Goal(objective, options.episodes, options.budget)
     name = default_name(base).removesuffix(f"-s{base.seed}")
     out = options.out or Path("runs") / f"sweep-{name}"
-    return Sweep(options, entries, ranges, goal, parallel.parse(options.seeds), out)
+    return Sweep(options, entries, ranges, goal, parallel.parse(options.seeds), base.trials, out)
 
 
 def run(options: Options) -> int:
@@ -118,7 +119,7 @@ def run(options: Options) -> int:
     """
     sweep = plan(options)
     study = _open(sweep)
-    units = len(sweep.seeds) * sweep.config({}).trials
+    units = len(sweep.seeds) * sweep.trials
     left = sum(not trial.state.is_finished() for trial in study.trials)
     left += max(0, options.tries - len(study.trials))
     with Progress("sweep", left * units, quiet=left == 0) as bar:
@@ -156,7 +157,7 @@ def _open(sweep: Sweep) -> Any:
             study = optuna.create_study(
                 study_name=NAME,
                 storage=optuna.storages.JournalStorage(backend),
-                pruner=optuna.pruners.MedianPruner(5, sweep.config({}).trials // 4),
+                pruner=optuna.pruners.MedianPruner(5, sweep.trials // 4),
                 direction=sweep.goal.direction,
                 load_if_exists=True,
             )
@@ -218,12 +219,13 @@ def _try(sweep: Sweep, trial: Any, bar: Progress) -> None:
     trial.study.sampler = optuna.samplers.TPESampler(seed=seed % 2**32)
     values = {n: space.fitting(n, r.suggest(trial, n)) for n, r in sweep.ranges.items()}
     shown = before = bar.done
+    facts = [f"try {trial.number}", *_best(sweep, trial.study)]  # reads the whole journal
     state = optuna.trial.TrialState
 
     def seen(number: int) -> None:
         nonlocal shown
         done = before + first + number
-        bar.update(done - shown, facts=[f"try {trial.number}", *_best(sweep, trial.study)])
+        bar.update(done - shown, facts=facts)
         shown = done
 
     try:
@@ -242,14 +244,12 @@ def _try(sweep: Sweep, trial: Any, bar: Progress) -> None:
         trial.set_user_attr("failed", str(error))
         say(f"try {trial.number} failed: {error}")
         trial.study.tell(trial, state=state.FAIL)
-    bar.update(before + len(sweep.seeds) * sweep.config({}).trials - shown)
+    bar.update(before + len(sweep.seeds) * sweep.trials - shown)
 
 
 def _complete(study: Any) -> list[Any]:
     """The tries that came to their end, the best first."""
-    done = [
-        trial for trial in study.trials if trial.value is not None and trial.state.name[0] == "C"
-    ]
+    done = [trial for trial in study.trials if trial.state.name == "COMPLETE"]
     sign = 1 if study.direction.name == "MINIMIZE" else -1
     return sorted(done, key=lambda trial: (sign * trial.value, trial.number))
 

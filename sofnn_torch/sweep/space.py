@@ -13,12 +13,11 @@ A TOML file like those for ``train.py --settings``, with a range or a list in th
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from sofnn_torch.runs import preset_files
 from sofnn_torch.runs.directory import flatten
-from sofnn_torch.runs.settings import MAZE, Config
+from sofnn_torch.runs.settings import MAZE, Config, why_idle
 
 FORMS = "a list of choices, { low = , high = }, perhaps with step or log, or { times = [ , ] }"
 DIGITS = 3  # of a number that is tried, so that flags give it exactly
@@ -90,13 +89,13 @@ def ranges(given: Mapping[str, Any], entries: Mapping[str, Any], where: str) -> 
         ValueError: one line on the first that is not right.
     """
     base = preset_files.make(entries)
-    usual, found = flatten(dataclasses.asdict(base)), {}
+    usual, idle, found = flatten(dataclasses.asdict(base)), base.idle(), {}
     if not given:
         raise ValueError(f"{where}: no setting to search for")
     for name, value in given.items():
         try:
             found[name] = range_ = _range(value, usual[name])
-            if why := base.idle().get(name) or base.idle().get(name.partition(".")[0]):
+            if why := why_idle(idle, name):
                 raise ValueError(f"it has no effect {why}")
             for end in range_.ends():
                 preset_files.make({**entries, name: fitting(name, end)})
@@ -109,15 +108,6 @@ def fitting(name: str, value: Any) -> Any:
     """A value as the setting takes it: one number for all inputs is a list of one."""
     several = isinstance(preset_files.KNOWN[name], list) and not isinstance(value, list)
     return [value] if several else value
-
-
-def read(path: Path) -> dict[str, Any]:
-    """A space in a file, by dotted names.
-
-    Raises:
-        ValueError: the file cannot be read, or a name is no setting.
-    """
-    return preset_files.read(path)
 
 
 def _range(value: Any, usual: Any) -> Range:

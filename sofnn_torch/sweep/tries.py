@@ -80,9 +80,7 @@ def learn(
             hopeless = trial.should_prune()
         return hopeless or goal.reached(record.total_steps)
 
-    options = training.RunOptions(
-        runs=run.parent, name=run.name, picture_every=0, video_every=0, quiet=True
-    )
+    options = training.RunOptions.silent(run)
     if not (run / "config.json").exists():
         training.train(config, options, after)
     else:
