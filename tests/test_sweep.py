@@ -218,12 +218,14 @@ def process(*words):
 
 @pytest.mark.slow
 def test_a_sweep_that_is_killed_again_and_again_ends_as_one_that_never_was(here):
+    begin = time.monotonic()
     assert process("--tries", "8", "--out", "whole").wait(600) == 0
+    took = time.monotonic() - begin
     clock, code, kills = random.Random(0), None, 0
     while code != 0:
         child = process("--tries", "8")
         try:
-            code = child.wait(clock.uniform(3, 12) * 1.1**kills)
+            code = child.wait(took * clock.uniform(0.3, 0.8) * 1.1**kills)
         except subprocess.TimeoutExpired:
             child.kill()
             child.wait()
