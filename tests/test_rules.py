@@ -18,7 +18,7 @@ from rich.console import Console
 from sofnn_torch import evaluate, training
 from sofnn_torch.network.sofnn import SOFNN
 from sofnn_torch.rules import __main__ as rules
-from sofnn_torch.rules import tables, words
+from sofnn_torch.rules import played, tables, words
 from sofnn_torch.runs import checkpoint, rule_files
 from sofnn_torch.runs.directory import load_config
 from sofnn_torch.runs.factory import make_agent
@@ -395,9 +395,10 @@ def test_the_command_reads_every_kind_of_rule(trained, tmp_path, call, variant):
 
 def test_usage_follows_the_pose_that_the_learner_sees(trained):
     config, agent, _, _ = evaluate.load(trained("constant"))  # sees its true pose
-    shares, decisions, outcome = rules.firing_along_a_trial(config, agent, seed=3)
+    shares, trial = rules.firing_along_a_trial(config, agent, seed=3)
     assert shares.sum() == pytest.approx(1, abs=1e-5)
-    assert outcome == "no goal after 80 steps" and decisions >= 8
+    assert played.outcome(trial.record) == "no goal after 80 steps"
+    assert trial.record.decisions == len(trial.states) >= 8
     again = rules.firing_along_a_trial(config, agent, seed=3)
     assert np.array_equal(shares, again[0])
 

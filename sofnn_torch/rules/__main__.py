@@ -1,6 +1,7 @@
 """Read the rules that a run has learned, write them to a file, load edited ones.
 
     python -m sofnn_torch.rules RUN                        # the rules that matter most, a table
+    python -m sofnn_torch.rules RUN --words 5              # as sentences, from start to goal
     python -m sofnn_torch.rules RUN --at 0.15 0.15 90      # who decides at a pose: m, m, degrees
     python -m sofnn_torch.rules RUN --why 0.15 0.15 90     # why it does what it does there
     python -m sofnn_torch.rules RUN --check                # what is doubtful in them
@@ -31,7 +32,7 @@ from sofnn_torch.bounds import Count, Settings, Within
 from sofnn_torch.evaluate import learned, load
 from sofnn_torch.learners.learner import Learner
 from sofnn_torch.pictures import figures, spots
-from sofnn_torch.rules import checks, new, played, tables, why, words
+from sofnn_torch.rules import checks, new, played, tables, terms, why, words
 from sofnn_torch.rules.editing import edited
 from sofnn_torch.rules.regions import actions_within
 from sofnn_torch.rules.words import Reading
@@ -52,6 +53,8 @@ class Options(Settings):
     """Directory of the run, or one of its checkpoint files."""
     top: Annotated[int, Within(least=0)] = 20
     """Rules in the table; 0 for all."""
+    words: Annotated[int, Within(least=2, most=7)] | None = None
+    """Print them as sentences in the order of the way, with so many terms on each axis."""
     at: tuple[float, ...] | None = None
     """Show which rules decide at a state instead: in the maze x and y in metres and the heading in
     degrees, in another task its inputs in their order and units."""
@@ -109,7 +112,7 @@ def check(options: Options) -> None:
     if options.decision and not options.why_trial:
         raise ValueError("--decision needs --why-trial")
     alone = ("load", "at", "why", "within", "check", "path", "why_trial")
-    given = [name for name in (*alone, *outputs) if getattr(options, name)]
+    given = [name for name in (*alone, *outputs, "words") if getattr(options, name)]
     pairs = ({"why", "picture"}, {"why_trial", "picture"}, {"path", "why_trial"})
     if len(given) > 1 and set(given) & set(alone) and set(given) not in pairs:
         a, b = (f"--{name}".replace("_", "-") for name in given[:2])
@@ -118,10 +121,10 @@ def check(options: Options) -> None:
 
 def firing_along_a_trial(
     config: Config, agent: Learner, seed: int
-) -> tuple[NDArray[Any], int, str]:
-    """Share of each rule (K,) in a trial without learning, its decisions, and how it went."""
+) -> tuple[NDArray[Any], played.Played]:
+    """Share of each rule (K,) in a trial without learning, and that trial."""
     trial = played.trial(config, agent, 1, seed)
-    return agent.usage(trial.states), trial.record.decisions, played.outcome(trial.record)
+    return agent.usage(trial.states), trial
 
 
 def explain(options: Options, config: Config, agent: Learner) -> None:
@@ -273,11 +276,17 @@ def run(options: Options) -> None:
         answers = actions_within(agent, *region_of(options, config))
         tables.show(tables.region_table(answers, config.task.axes))
         return
-    shares, decisions, outcome = firing_along_a_trial(config, agent, options.seed)
+    shares, trial = firing_along_a_trial(config, agent, options.seed)
+    decisions, outcome = trial.record.decisions, played.outcome(trial.record)
     print(f"one trial without learning or exploration, seed {options.seed}: {outcome}")
     print(tables.summary(shares, decisions, reading))
     files = [path for path in (options.json, options.csv, options.picture) if path]
-    if not files:
+    if options.words:
+        said = terms.sentences(agent, reading, options.words)
+        when = played.moments(agent, trial.states)
+        print(tables.along_the_way(said, shares, when, decisions, options.top))
+        print(*(axis.bounds() for axis in terms.of_rules(agent, options.words)), sep="\n")
+    elif not files:
         tables.show(tables.table(reading, shares, options.top))
     write(options, config, agent, reading, shares)
     for file in files:

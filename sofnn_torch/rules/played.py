@@ -73,6 +73,11 @@ def trial(config: Config, agent: Learner, number: int, seed: int) -> Played:
     return Played(record, states, diary.actions, diary.rewards, diary.infos[:-1])
 
 
+def moments(agent: Learner, states: NDArray[np.float32]) -> NDArray[np.int64]:
+    """The decision, from 0, at which each rule (K,) has its largest share along states (T, n)."""
+    return np.array([agent.firing(state).numpy().mean(0) for state in states]).argmax(0)
+
+
 def to_csv(agent: Learner, played: Played) -> bytes:
     """A line for each decision: where, what, which rule fires most.
 

@@ -1,5 +1,6 @@
 """What is known of rules, as tables for the terminal."""
 
+import textwrap
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -46,6 +47,31 @@ def table(reading: Reading, shares: NDArray[Any], top: int) -> Table:
         cells[len(reading.antecedents)] += " *" * int(reading.outvoted[rule])
         view.add_row(str(rule + 1), f"{shares[rule]:.1%}", *cells)
     return view
+
+
+def along_the_way(
+    sentences: Sequence[str], shares: NDArray[Any], moments: NDArray[Any], decisions: int, top: int
+) -> str:
+    """The rules with the largest shares (K,) as sentences in the order of the way; 0 for all.
+
+    Args:
+        sentences: of all K rules.
+        shares: of them in a trial.
+        moments: the decision, from 0, at which each has its largest share. Shape: (K,).
+        decisions: of the trial.
+        top: how many rules.
+    """
+    rules = np.argsort(-shares, kind="stable")[: top or None]
+    idle = shares * decisions < FIRED
+    rules = rules[np.lexsort((moments[rules], idle[rules]))]
+    lines = ["decision  rule  share"]
+    for k in rules.tolist():
+        when = "" if idle[k] else f"{moments[k] + 1:,}"
+        lines.append(f"{when:>8}  {k + 1:>4}  {shares[k]:>5.1%}  {sentences[k]}")
+    console = Console()
+    if console.is_terminal:  # a file keeps a rule on a line
+        lines = [textwrap.fill(line, console.width, subsequent_indent=" " * 23) for line in lines]
+    return "\n".join(lines)
 
 
 def decision_table(reading: Reading, decision: Decision, by_action: bool) -> Table:

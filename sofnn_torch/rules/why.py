@@ -19,7 +19,6 @@ NEAR = 0.1  # m between robot and wall within which the wall is named
 ENOUGH = 0.9  # share of the firing whose rules are listed
 MOST = 12  # rules in the table
 NAMED = 0.05  # share from which a rule is named in the sentence
-COMPASS = ("east", "north-east", "north", "north-west", "west", "south-west", "south", "south-east")
 DONE = {"right turn": "turned right", "left turn": "turned left", "straight": "went straight"}
 
 
@@ -142,7 +141,7 @@ def nearest_wall(plan: MazePlan, x: float, y: float) -> tuple[float, float]:
 
 def compass(bearing: float) -> str:
     """A bearing [rad] in words; east is along x."""
-    return COMPASS[words.octant(bearing)]
+    return words.COMPASS[words.octant(bearing)]
 
 
 def table(agent: Learner, why: Reason) -> Table:

@@ -16,6 +16,7 @@ from sofnn_torch.network.axes import Axis
 
 MANY = 5  # actions that are shown side by side
 WINDS = ("E", "NE", "N", "NW", "W", "SW", "S", "SE")  # east is along x, north along y
+COMPASS = ("east", "north-east", "north", "north-west", "west", "south-west", "south", "south-east")
 
 
 @dataclass(frozen=True)
@@ -27,11 +28,14 @@ class Reading:
         consequents: by the name of what is concluded; the chosen action has no name.
         outvoted: whether all rules together choose another action at the centre of a rule than the
             rule itself; False where actions are continuous or antecedents. Shape: (K,).
+        together: the action that all rules choose at the centre of each; none where actions are
+            continuous.
     """
 
     antecedents: dict[str, list[str]]
     consequents: dict[str, list[str]]
     outvoted: NDArray[np.bool_]
+    together: list[str]
 
     def brief(self) -> list[str]:
         """The main conclusion of each rule in a few words, for a legend."""
@@ -101,24 +105,25 @@ def read(agent: Learner) -> Reading:
     return Reading(columns, *_consequents(agent))
 
 
-def _consequents(agent: Learner) -> tuple[dict[str, list[str]], NDArray[np.bool_]]:
-    """The consequents of a `Reading`, and which rules are outvoted."""
+def _consequents(agent: Learner) -> tuple[dict[str, list[str]], NDArray[np.bool_], list[str]]:
+    """The consequents of a `Reading`, which rules are outvoted, and by what."""
     centres = agent.net.centres
     names, table = agent.conclusions(centres)
     numbers = {name: list(map(number, table[:, i].tolist())) for i, name in enumerate(names)}
     nobody = np.zeros(len(centres), bool)
     if not agent.choices:
-        return numbers, nobody
+        return numbers, nobody, []
     together = agent.plan(centres[:, : len(agent.task.axes)].numpy()).choice
     assert together is not None  # there are choices
+    there = [agent.choices[j] for j in together.tolist()]
     alone = agent.alone(table)
     if alone is None:  # each rule is about one action
-        return numbers | {"best there": [agent.choices[j] for j in together.tolist()]}, nobody
+        return numbers | {"best there": there}, nobody, there
     said = [*agent.choices, "undecided"]  # the last for -1
     if len(names) > MANY:
         numbers = {"Q": list(map(number, table.max(1).tolist()))}
     words = [said[j] for j in alone.tolist()]
-    return {"": words} | numbers, (alone >= 0) & (alone != together)
+    return {"": words} | numbers, (alone >= 0) & (alone != together), there
 
 
 @torch.no_grad()
