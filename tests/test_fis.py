@@ -9,7 +9,7 @@ import pytest
 from exported import ALL, learner, states
 from test_export import command  # noqa: F401
 
-from sofnn_torch.export import fis, policy, runtime
+from sofnn_torch.export import fis, policy, runtime, sugeno
 from sofnn_torch.runs.factory import make_env
 
 OTHER = """% rules by hand: turn towards north, go straight there
@@ -70,7 +70,7 @@ def test_a_written_system_concludes_as_the_policy_and_is_read_again(tmp_path, ki
     base, ours = fis.read(path), runtime.Policy(data)
     x = states(agent, 300).clip(ours.low, ours.high)
     x[:, ours.periods[: x.shape[1]] > 0] *= 0.9  # the seam is at the ends of the axis
-    again = runtime.Policy(fis.as_policy(base, data))
+    again = runtime.Policy(sugeno.as_policy(base, data))
     if data["decision"]["kind"] == "values":
         np.testing.assert_allclose(again.values(x), ours.values(x), atol=1e-6)
     else:
@@ -83,7 +83,7 @@ def test_a_written_system_concludes_as_the_policy_and_is_read_again(tmp_path, ki
 def test_rules_that_are_nearly_or_quite_the_same_stay_as_many(tmp_path):
     """Only a rule a whole turn away is the same: each counts in a normalised sum."""
     data = policy.describe(*learner("three"))
-    base = fis.system(data)
+    base = sugeno.system(data)
     near = base.centres[:1] + [1e-7, 0, 0]
     more = dataclasses.replace(
         base,
@@ -91,7 +91,7 @@ def test_rules_that_are_nearly_or_quite_the_same_stay_as_many(tmp_path):
         widths=np.vstack([base.widths, base.widths[:1], base.widths[:1]]),
         slopes=np.vstack([base.slopes, base.slopes[:1], base.slopes[:1]]),
     )
-    rules = fis.as_policy(more, data)["rules"]
+    rules = sugeno.as_policy(more, data)["rules"]
     assert len(rules) == len(data["rules"]) + 2
 
 

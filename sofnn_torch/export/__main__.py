@@ -2,7 +2,7 @@
 
     python -m sofnn_torch.export RUN --to policy.json       # and sofnn_runtime.py: NumPy alone
     python -m sofnn_torch.export RUN --to policy.h          # C99; --precision int16: no library
-    python -m sofnn_torch.export RUN --to policy.onnx policy.fis
+    python -m sofnn_torch.export RUN --to policy.onnx policy.fis policy.fml policy.fcl
     python -m sofnn_torch.export other.fis --like RUN --to policy.json
 
 The run directory is not changed. docs/export.md says what each format holds and what it cannot.
@@ -21,7 +21,7 @@ import tyro
 
 from sofnn_torch.bounds import Settings
 from sofnn_torch.evaluate import load
-from sofnn_torch.export import c, fis, graph, policy
+from sofnn_torch.export import c, fcl, fis, fml, graph, policy, sugeno
 from sofnn_torch.runs import checkpoint
 from sofnn_torch.terminal import check_output, command, plural
 
@@ -35,6 +35,13 @@ WRITERS: dict[str, Callable[[dict[str, Any], Path, str], bytes]] = {
     ".h": c.to_header,
     ".onnx": graph.to_onnx,
     ".fis": fis.to_fis,
+    ".fml": fml.to_fml,
+    ".fcl": fcl.to_fcl,
+}
+SYSTEMS: dict[str, Callable[[Path], sugeno.Sugeno]] = {  # rules of other tools
+    ".fis": fis.read,
+    ".fml": fml.read,
+    ".fcl": fcl.read,
 }
 
 
@@ -46,12 +53,13 @@ class Options(Settings):
     """Directory of the run, one of its checkpoint files, or a file that this command wrote."""
     to: tuple[Path, ...]
     """Files to write; their endings say in which formats: .json (and a file that plays it with
-    NumPy alone), .h (C99), .onnx, .fis (MATLAB, Octave)."""
+    NumPy alone), .h (C99), .onnx, .fis (MATLAB, Octave), .fml (IEEE 1855), .fcl (IEC 61131-7)."""
     precision: Literal["float", "int16"] = "float"
     """Numbers of the C header: `float`, with math.h, or `int16`, whole numbers without any
     library."""
     like: Path | None = None
-    """Where RUN is a .fis file: the run or exported policy whose axes and actions it is for."""
+    """Where RUN is a .fis, .fml or .fcl file: the run or exported policy whose axes and actions it
+    is for."""
     best: bool = False
     """Take the checkpoint with the best last 10 trials instead of the latest."""
 
@@ -68,8 +76,8 @@ def check(options: Options) -> None:
         check_output("--to", path, tuple(WRITERS))
     if options.precision != "float" and not any(p.suffix.lower() == ".h" for p in options.to):
         raise ValueError("--precision is for a C header: give --to a file that ends in .h")
-    if (options.run.suffix.lower() == ".fis") != bool(options.like):
-        raise ValueError("--like RUN and a .fis file as source need each other")
+    if (options.run.suffix.lower() in SYSTEMS) != bool(options.like):
+        raise ValueError("--like RUN and a .fis, .fml or .fcl file as source need each other")
     if options.best and options.run.suffix.lower() in READERS:
         raise ValueError(f"--best chooses a checkpoint of a run, and {options.run} is a policy")
 
@@ -99,7 +107,7 @@ def run(options: Options) -> None:
     if options.like:
         if "fixed" in data:
             raise ValueError(f"--like {options.like} holds rounded numbers: take the run itself")
-        data = fis.as_policy(fis.read(options.run), data)
+        data = sugeno.as_policy(SYSTEMS[options.run.suffix.lower()](options.run), data)
     if "fixed" in data and any(path.suffix.lower() != ".h" for path in options.to):
         raise ValueError(f"{options.run} holds rounded numbers: export the run itself")
     written = [
