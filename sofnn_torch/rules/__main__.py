@@ -8,6 +8,7 @@
     python -m sofnn_torch.rules RUN --within 0.1 0.2 0.1 0.2 60 120   # what it can do in a region
     python -m sofnn_torch.rules RUN --json rules.json --csv rules.csv --picture rules.png
     python -m sofnn_torch.rules RUN --load rules.json      # edited rules become a new run
+    python -m sofnn_torch.rules RUN --reduce 40            # few rules that drive as well, a new run
     python -m sofnn_torch.rules --new rules.csv            # rules alone do: with flags of train.py
 
 The run directory is not changed. docs/rules.md says how to read a rule and what a file holds.
@@ -34,6 +35,7 @@ from sofnn_torch.learners.learner import Learner
 from sofnn_torch.pictures import figures, spots
 from sofnn_torch.rules import checks, new, played, tables, terms, why, words
 from sofnn_torch.rules.editing import edited
+from sofnn_torch.rules.reducing import reduce_run
 from sofnn_torch.rules.regions import actions_within
 from sofnn_torch.rules.words import Reading
 from sofnn_torch.runs import checkpoint, rule_files
@@ -43,6 +45,7 @@ from sofnn_torch.runs.settings import MAZE, Config
 from sofnn_torch.terminal import attempt, check_output, command, plural, say
 
 PICTURES = (".png", ".svg", ".pdf")
+ALONE = ("load", "reduce", "at", "why", "within", "check", "path", "why_trial")
 
 
 @dataclass(frozen=True)
@@ -82,10 +85,13 @@ class Options(Settings):
     """Draw the rules into this .png, .svg or .pdf file."""
     load: Path | None = None
     """Make a new run out of this one and the rules in a .json or .csv file."""
+    reduce: tuple[Count, ...] | None = None
+    """Make a new run with so many rules that does what this one does; one for each number."""
     name: str | None = None
-    """Name of the new run; by default that of the old one with `-edited`."""
+    """Name of the new run; by default that of the old one with `-edited` or, say, `-40-rules`."""
     seed: Annotated[int, Within(least=0)] = 1000
-    """Seed of the trials: that which shows how much each rule is used, and those of --why-trial."""
+    """Seed of the trials: that which shows how much each rule is used, those of --why-trial, and of
+    all chance in --reduce."""
 
 
 def check(options: Options) -> None:
@@ -100,8 +106,8 @@ def check(options: Options) -> None:
             raise ValueError(f"--{name} must be a state in the units of its inputs, got {values}")
     if options.within and not all(abs(value) < 1e6 for value in options.within):
         raise ValueError(f"--within needs ends in the units of its inputs, got {options.within}")
-    if options.name is not None and not options.load:
-        raise ValueError("--name goes with --load")
+    if options.name is not None and not options.load and len(options.reduce or ()) != 1:
+        raise ValueError("--name goes with --load, or with --reduce and one number")
     RunOptions(name=options.name)
     outputs = {name: getattr(options, name) for name in ("json", "csv", "picture")}
     for name, path in outputs.items():
@@ -111,10 +117,9 @@ def check(options: Options) -> None:
         raise ValueError("--why-trial and --decision go together")
     if options.decision and not options.why_trial:
         raise ValueError("--decision needs --why-trial")
-    alone = ("load", "at", "why", "within", "check", "path", "why_trial")
-    given = [name for name in (*alone, *outputs, "words") if getattr(options, name)]
+    given = [name for name in (*ALONE, *outputs, "words") if getattr(options, name)]
     pairs = ({"why", "picture"}, {"why_trial", "picture"}, {"path", "why_trial"})
-    if len(given) > 1 and set(given) & set(alone) and set(given) not in pairs:
+    if len(given) > 1 and set(given) & set(ALONE) and set(given) not in pairs:
         a, b = (f"--{name}".replace("_", "-") for name in given[:2])
         raise ValueError(f"{a} and {b} do not go together: use two commands")
 
@@ -259,6 +264,9 @@ def run(options: Options) -> None:
         print(f"one trial without learning, seed {options.seed}: {played.outcome(trial.record)}")
         plan = make_plan(config) if config.env == MAZE else None
         print(checks.report(checks.findings(agent, trial.states, plan)))
+        return
+    if options.reduce:
+        reduce_run(options.run, loaded, options.reduce, options.name, options.seed)
         return
     reading = words.read(agent)
     if options.at:

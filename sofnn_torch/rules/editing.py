@@ -1,11 +1,14 @@
-"""Rules from a file in the place of those that a run has learned."""
+"""Other rules in the place of those that a run has learned: from a file, or fewer ones."""
 
 import dataclasses
 import json
 import shutil
+from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 from sofnn_torch.evaluate import Loaded
+from sofnn_torch.learners.learner import Learner
 from sofnn_torch.runs import checkpoint, rule_files
 from sofnn_torch.runs.directory import Run
 from sofnn_torch.runs.places import numbered
@@ -25,26 +28,65 @@ def edited(source: Path, loaded: Loaded, file: Path, name: str | None = None) ->
         ValueError: rules that the run cannot have, or a directory that cannot be written; nothing
             is left behind then.
     """
-    config, agent, path, state = loaded
-    kind = rule_files.schema(agent)
-    table = rule_files.read(file, kind)
-    rule_files.put(agent, table)
+    agent = loaded.agent
+    rule_files.put(agent, rule_files.read(file, rule_files.schema(agent)))
+    places = places_of(source, name, "edited", "--load")
+    return renewed(source, loaded, agent, places, {"edited": {"rules": str(file)}})
+
+
+def places_of(source: Path, name: str | None, ending: str, flag: str) -> Iterable[Path]:
+    """Where a run made of another one may be: beside it.
+
+    Args:
+        source: the run or checkpoint file that was named.
+        name: of the new run.
+        ending: behind the name of the old one, if no name is given.
+        flag: that asks for it.
+
+    Raises:
+        ValueError: a checkpoint that lies in no run.
+    """
+    home = home_of(source)
+    if home is None:
+        raise ValueError(f"{source}: {flag} needs a run directory or a checkpoint in one")
+    home = home if home.name not in ("", "..") else home.resolve()
+    return [home.with_name(name)] if name else numbered(home.with_name(f"{home.name}-{ending}"))
+
+
+def renewed(
+    source: Path,
+    loaded: Loaded,
+    agent: Learner,
+    places: Iterable[Path],
+    why: dict[str, dict[str, Any]],
+) -> Path:
+    """Make a run with other rules and the rest of a state; its directory.
+
+    Args:
+        source: the run or checkpoint file that was named, in a run.
+        loaded: what it holds.
+        agent: a learner with the rules.
+        places: where the new run may be.
+        why: what was done, for config.json; the checkpoint is added.
+
+    Raises:
+        ValueError: a directory that cannot be written; nothing is left behind then.
+    """
+    config, _, path, state = loaded
     if config.rules:  # the rules that learn at the rates of given ones are now these
+        table = agent.net.table().detach().T.numpy()
         agent.net.given = len(table)
-        config = dataclasses.replace(config, rules=rule_files.to_csv(kind, table, {}).decode())
+        text = rule_files.to_csv(rule_files.schema(agent), table, {}).decode()
+        config = dataclasses.replace(config, rules=text)
         state = state | {"config": dataclasses.asdict(config)}
     # The best and the last ten trials were those of other rules.
     state = state | {"network": checkpoint.describe(agent.net), "recent": [], "best": []}
     state["agent"] = state["agent"] | {"net": agent.net.state_dict()}
     home = home_of(source)
-    if home is None:
-        raise ValueError(f"{source}: --load needs a run directory or a checkpoint in one")
-    home = home if home.name not in ("", "..") else home.resolve()
-    usual = numbered(home.with_name(f"{home.name}-edited"))
-    places = [home.with_name(name)] if name else usual
+    assert home is not None  # `places_of` looked
     before = json.loads((home / "config.json").read_bytes())
     session = {"versions": before.get("versions"), "commit": before.get("commit")}
-    session["edited"] = {"checkpoint": str(path), "rules": str(file)}
+    session |= {what: {"checkpoint": str(path)} | how for what, how in why.items()}
     earlier = [*before.get("earlier", []), session]
     with Run.create(places, config, RunOptions.keep, earlier) as run:
         if (trials := home / "trials.csv").exists():

@@ -12,7 +12,7 @@ from sofnn_torch.learners.learner import Learner
 
 # Training's motor noise is not what a policy is then judged by, whatever the seeds. The learner in
 # training draws from the plain seed.
-NUMBERS = {"training": 1, "maze": 2, "policy": 3, "start": 4}
+NUMBERS = {"training": 1, "maze": 2, "policy": 3, "start": 4, "reduction": 5}
 
 
 def stream(name: str, seed: int) -> int:
@@ -20,7 +20,8 @@ def stream(name: str, seed: int) -> int:
 
     Args:
         name: ``training`` (motor noise while a robot learns), and in trials without learning
-            ``maze`` (motor noise), ``policy`` (the policy's chance) or ``start`` (where it begins).
+            ``maze`` (motor noise), ``policy`` (the policy's chance) or ``start`` (where it begins);
+            ``reduction``, all chance while a rule base is made smaller.
         seed: seed of the run or of the evaluation.
     """
     return int(np.random.SeedSequence([seed, NUMBERS[name]]).generate_state(1)[0])
