@@ -11,7 +11,6 @@ NumPy's scalars become Python's, so that what is written of settings can be read
 """
 
 import dataclasses
-import math
 import types
 import typing
 from dataclasses import dataclass
@@ -100,6 +99,11 @@ class Settings:
             if checked is not value:
                 object.__setattr__(self, field.name, checked)  # the dataclass is frozen
 
+    @classmethod
+    def upgraded(cls, data: dict[str, Any]) -> dict[str, Any]:
+        """Plain data of an older version as this one writes it."""
+        return data
+
     def idle(self) -> dict[str, str]:
         """Fields that change nothing beside the others, and why."""
         return {}
@@ -118,7 +122,7 @@ def read(data: Any, kind: Any, where: str = "") -> Any:
     """
     if not isinstance(data, dict):
         raise ValueError(f"{where or 'the settings'}: a table of names and values is needed")
-    hints = typing.get_type_hints(kind)
+    data, hints = kind.upgraded(data), typing.get_type_hints(kind)
     known = {field.name for field in dataclasses.fields(kind)}
     if unknown := sorted(str(name) for name in data.keys() - known):
         raise ValueError(
@@ -179,7 +183,7 @@ def _plain(value: Any, hint: Any, name: str) -> Any:
         raise ValueError(f"{name} must be {NAMES[hint]}, got {_show(value)}")
     if hint is int and not abs(int(value)) < INTEGER:
         raise ValueError(f"{name} must lie between -2**63 and 2**63, got {_show(value)}")
-    if hint is float and not (math.isfinite(value) and abs(value) < FINITE):
+    if hint is float and not abs(value.item() if isinstance(value, np.generic) else value) < FINITE:
         raise ValueError(f"{name} must be a finite number, got {_show(value)}")
     return hint(value)
 

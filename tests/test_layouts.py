@@ -245,7 +245,7 @@ def test_of_any_goals_each_ends_the_trial_and_of_varying_ones_that_which_is_told
         env.physics.place((*env.plan.goals[1 - env.goal], 0.0))
         assert not env.step(0)[2]
         env.physics.place((*env.plan.goals[env.goal], 0.0))
-        other = KheperaMazeEnv(layout=env.layout)
+        other = KheperaMazeEnv(layout=env.settings.layout)
         other.load_state_dict(env.state_dict())
         assert env.step(0)[2] and other.step(0)[2]
     assert told == {0, 1}

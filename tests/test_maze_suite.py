@@ -81,7 +81,7 @@ def test_a_seed_decides_the_trajectory(kind):
 
 @pytest.mark.parametrize("kind", [kind | {"range_sensors": True} for kind in KINDS[1::2]], ids=str)
 def test_observations_are_valid_not_aliased_and_change(kind):
-    env = KheperaMazeEnv(hold=3, **kind)
+    env = KheperaMazeEnv(**kind)
     observation, _ = env.reset(seed=0)
     env.action_space.seed(0)
     kept, copies = [observation], [observation.copy()]

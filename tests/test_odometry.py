@@ -11,6 +11,7 @@ from sofnn_torch.maze.layouts import standard_path
 from sofnn_torch.maze.odometry import (
     DRAG,
     FORWARD_SPEED,
+    ROBOT_RADIUS,
     STEP_LENGTH,
     DeadReckoning,
     MotorNoise,
@@ -90,7 +91,7 @@ def test_dead_reckoning_follows_an_arc():
     assert pose == pytest.approx((0.6, 0.6, QUARTER), abs=1e-5)
 
 
-@pytest.mark.parametrize("mode", ["guarded", "still"])
+@pytest.mark.parametrize("mode", ["slide", "still"])
 def test_an_estimate_waits_at_walls_and_stays_inside(mode):
     estimator = DeadReckoning(mode, arena=(1.0, 0.8))
     estimator.fix((0.5, 0.5, 0.0))
@@ -98,13 +99,13 @@ def test_an_estimate_waits_at_walls_and_stays_inside(mode):
     assert estimator.pose == pytest.approx((0.5, 0.5, 0.0))
     estimator.update(-0.002, 0.002, [0.0])  # a robot at a wall still turns
     assert estimator.pose == pytest.approx((0.5, 0.5, 0.08))
-    estimator.fix((0.999, 0.799, 0.25 * math.pi))
+    estimator.fix((0.972, 0.772, 0.25 * math.pi))
     estimator.update(0.005, 0.005)
-    assert estimator.pose[:2] == (1.0, 0.8)
+    assert estimator.pose[:2] == (1.0 - ROBOT_RADIUS, 0.8 - ROBOT_RADIUS)
 
 
 def test_an_estimate_slides_along_a_wall():
-    estimator = DeadReckoning("guarded")
+    estimator = DeadReckoning("slide")
     estimator.fix((0.5, 0.5, 0.25 * math.pi))  # to the north-east, against a wall in the east
     estimator.update(0.005, 0.005, [-0.25 * math.pi])
     way = 0.005 * math.sqrt(0.5) / (0.5 + 0.5 * DRAG)
@@ -126,7 +127,7 @@ def test_the_heading_of_an_estimate_is_wrapped_also_at_a_wall():
 
 
 def test_an_estimate_stands_still_in_a_corner_as_the_robot_does():
-    env = KheperaMazeEnv(motor_noise=0.0)
+    env = KheperaMazeEnv(bumps="contact", right_angles=False, motor_noise=0.0)
     env.reset(options={"pose": (0.972, 0.028, -0.5 * QUARTER)})
     env.step(STRAIGHT)
     assert env.physics.wall_bearings() == pytest.approx([-0.5 * QUARTER, 0.5 * QUARTER], abs=0.01)
@@ -138,7 +139,7 @@ def test_an_estimate_stands_still_in_a_corner_as_the_robot_does():
 @pytest.mark.parametrize("bearing", [0.1, 0.3, 0.5, 0.7, 0.9, 1.1, 1.3])
 @pytest.mark.parametrize("side", [-1, 1])
 def test_the_robot_slides_as_its_estimate_does(bearing, side):
-    env = KheperaMazeEnv(motor_noise=0.0)
+    env = KheperaMazeEnv(bumps="contact", right_angles=False, motor_noise=0.0)
     env.reset(seed=0, options={"pose": (0.5, 0.0276, -QUARTER + side * (QUARTER - bearing))})
     env.step(STRAIGHT)
     env.estimator.fix(env.physics.pose())
@@ -198,19 +199,38 @@ def visit(env, place):
     return env.step(LEFT)[4]
 
 
-@pytest.mark.parametrize("mode", ["guarded", "still", "literal"])
-def test_landmarks_correct_the_estimate(mode):
-    env = KheperaMazeEnv(dead_reckoning=mode, motor_noise=0.0)
+@pytest.mark.parametrize(
+    ("landmarks", "expected"),
+    [
+        ("pose", [0, 1, 0, 1, 0, 0]),  # on every entry
+        ("position", [0, 1, 0, 1, 0, 0]),
+        ("inside", [0, 1, 0, 1, 1, 1]),  # at every step, and the start is a landmark too
+        ("first", [0, 1, 0, 0, 0, 0]),
+    ],
+)
+def test_landmarks_correct_the_estimate(landmarks, expected):
+    env = KheperaMazeEnv(landmarks=landmarks, motor_noise=0.0)
     env.reset(seed=0)
     corrected = []
     lost, (x, y) = (0.5, 0.5), env.plan.subgoals[0]
-    for place in (lost, (x, y), lost, (x - 0.05, y), env.plan.start[:2]):
+    for place in (lost, (x, y), lost, (x - 0.05, y), (x, y), env.plan.start[:2]):
+        env.estimator.pose = (0.6, 0.6, 2.0)  # as if it was lost altogether
         info = visit(env, place)
-        error = math.dist(info["true_pose"][:2], info["estimated_pose"][:2])
-        corrected.append(error < 1e-9)
-    # Guarded: at every landmark, the start included. Literal: only when first found.
-    expected = [0, 1, 0, 0, 0] if mode == "literal" else [0, 1, 0, 1, 1]
+        x_error, y_error, turned = info["true_pose"] - info["estimated_pose"]
+        corrected.append(math.hypot(x_error, y_error) < 1e-9)
+        assert (abs(turned) < 1e-3) == (corrected[-1] and landmarks != "position")
     assert corrected == list(map(bool, expected))
+
+
+def test_a_restored_robot_knows_that_it_was_inside_a_landmark():
+    env, other = (KheperaMazeEnv(motor_noise=0.0) for _ in range(2))
+    env.reset(seed=0)
+    visit(env, env.plan.subgoals[0])
+    other.reset(seed=1)
+    other.load_state_dict(env.state_dict())
+    for robot in (env, other):
+        robot.estimator.pose = (0.5, 0.5, 0.0)
+        assert robot.step(LEFT)[4]["estimated_pose"][:2] == pytest.approx([0.5, 0.5])
 
 
 def test_a_reset_corrects_the_estimate():
@@ -295,7 +315,7 @@ def test_drift_over_200_runs(open_field):
         (lambda: MotorNoise(-0.1), "motor_noise"),
         (lambda: MotorNoise(0.1, "both"), "wheel_noise"),
         (lambda: DeadReckoning("gps"), "dead_reckoning"),
-        (lambda: DeadReckoning("guarded", wheel_base=0.0), "wheel_base"),
+        (lambda: DeadReckoning("slide", wheel_base=0.0), "wheel_base"),
     ],
 )
 def test_impossible_settings_are_refused(build, message):

@@ -9,7 +9,7 @@ from conftest import settings
 
 from sofnn_torch.runs.directory import flatten
 from sofnn_torch.runs.factory import make_agent
-from sofnn_torch.runs.settings import Config
+from sofnn_torch.runs.settings import Config, MazeConfig, from_dict
 
 # Section 5, as printed; a decay of 1 is equation 6, of 0 are equations 12-15.
 PRINTED = {
@@ -116,3 +116,26 @@ def test_an_unknown_state_keeps_its_initial_value_where_the_policy_is_interpolat
 def test_the_sets_of_the_default_are_those_that_the_documents_print(agent, network, theta, widths):
     net = Config(agent=agent, network=network).net
     assert (net.theta, net.width_position, net.width_heading) == (theta, *widths)
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("guarded", ("slide", "inside")),
+        ("still", ("still", "inside")),
+        ("literal", ("literal", "first")),
+    ],
+)
+def test_a_run_from_before_the_infrared_sensors_is_told_what_it_was_told(old, new):
+    data = asdict(Config())
+    for name in ("bumps", "infrared_noise", "landmarks", "right_angles"):
+        del data["maze"][name]
+    maze = from_dict(data | {"maze": data["maze"] | {"dead_reckoning": old}}).maze
+    assert (maze.dead_reckoning, maze.landmarks) == new
+    assert maze.bumps == "contact" and not maze.right_angles
+    assert from_dict(asdict(Config())) == Config()
+
+
+def test_whole_numbers_beyond_all_floats_are_refused():
+    with pytest.raises(ValueError, match=r"--maze.goal-reward must be a finite number"):
+        MazeConfig(goal_reward=10**400)

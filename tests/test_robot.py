@@ -6,7 +6,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from sofnn_torch.maze.robot import INFRARED, Physics, load_model
+from sofnn_torch.maze.robot import Physics, load_model
+from sofnn_torch.maze.sensors import INFRARED, INFRARED_RANGE
 
 FORWARD = (0.010, 0.010)
 TURN_LEFT = (-0.004, 0.004)
@@ -96,8 +97,10 @@ def test_infrared_ranges_see_walls():
     ahead = 1.0 - 0.93 - 0.0245
     assert ranges["ir_left_0"] == pytest.approx(ahead, abs=1e-3)
     assert ranges["ir_right_0"] == pytest.approx(ahead, abs=1e-3)
-    assert ranges["ir_right_45"] == pytest.approx((0.07 - 0.018) * math.sqrt(2.0), abs=1e-3)
-    assert ranges["ir_back_left"] == ranges["ir_right_90"] == 0.1
+    physics.place((0.96, 0.15, 0.0))
+    ranges = dict(zip(INFRARED, physics.infrared_ranges(), strict=True))
+    assert ranges["ir_right_45"] == pytest.approx((0.04 - 0.018) * math.sqrt(2.0), abs=1e-3)
+    assert ranges["ir_back_left"] == ranges["ir_right_90"] == INFRARED_RANGE
 
 
 def test_ranges_are_only_computed_when_they_are_asked_for():

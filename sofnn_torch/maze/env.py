@@ -1,13 +1,12 @@
 """The Khepera in its maze as a Gymnasium environment: decisions, rewards, pose estimates."""
 
-from collections.abc import Callable, Sequence
-from pathlib import Path
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import gymnasium
 import numpy as np
 
-from sofnn_torch.maze.arguments import choice, real, show, vector, whole
+from sofnn_torch.maze.arguments import choice, real, show, vector
 from sofnn_torch.maze.odometry import (
     FORWARD_SPEED,
     STEP_SECONDS,
@@ -19,7 +18,8 @@ from sofnn_torch.maze.odometry import (
 )
 from sofnn_torch.maze.plan import MazePlan
 from sofnn_torch.maze.rendering import OffscreenRenderer
-from sofnn_torch.maze.robot import Physics, checked, load_model
+from sofnn_torch.maze.robot import Physics, load_model
+from sofnn_torch.maze.sensors import INFRARED, felt_walls, readings
 from sofnn_torch.maze.settings import MazeConfig, axes
 from sofnn_torch.maze.spaces import (
     ACTION_NAMES,
@@ -35,7 +35,6 @@ from sofnn_torch.network.axes import Axis
 
 __all__ = ["LEFT", "RIGHT", "STRAIGHT", "KheperaMazeEnv", "MazePlan", "Physics"]
 
-MAX_HOLD = 10_000  # steps; motor noise is drawn for a whole decision at once
 START, GOAL = -2, -1  # zones; the others are the numbers of sub-goals
 
 
@@ -47,7 +46,7 @@ class KheperaMazeEnv(gymnasium.Env[np.ndarray, Any]):
 
     Observation, float32 (3,): x [m], y [m], heading [rad, in [-pi, pi)] by the chosen `pose`:
     "estimated" adds up commanded movements, "odometry" wheel encoders, "true" is the simulated
-    robot's. With `range_sensors` (12,): 8 infrared ranges [m] and the bumper (0 or 1) follow.
+    robot's. With `range_sensors` (12,): 8 infrared readings [m] and the bump (0 or 1) follow.
 
     Actions: "three" is Discrete(3), the paper's right turn (0), straight (1), left turn (2).
     "steer" is Box(1,) from -1 (right turn) over 0 (straight) to 1 (left turn). "wheels" is Box(2,),
@@ -71,87 +70,52 @@ class KheperaMazeEnv(gymnasium.Env[np.ndarray, Any]):
     def __init__(
         self,
         pose: str = "estimated",
-        layout: str | Path = MazeConfig.layout,
-        actions: str = MazeConfig.actions,
-        hold: int = MazeConfig.hold,
-        max_steps: int = MazeConfig.max_steps,
-        motor_noise: float = MazeConfig.motor_noise,
-        wheel_noise: str = MazeConfig.wheel_noise,
-        dead_reckoning: str = MazeConfig.dead_reckoning,
-        goal_reward: float = MazeConfig.goal_reward,
-        collision_reward: float = MazeConfig.collision_reward,
-        subgoal_reward: float = MazeConfig.subgoal_reward,
-        step_reward: float = MazeConfig.step_reward,
-        wheel_radius_scale: float = MazeConfig.wheel_radius_scale,
-        wheel_base_scale: float = MazeConfig.wheel_base_scale,
         range_sensors: bool = False,
         render_mode: str | None = None,
         camera: str = "top",
         width: int = 480,
         height: int = 480,
         speed: float = 20.0,
+        **settings: Any,
     ) -> None:
         """Build the environment.
 
         Args:
             pose: "estimated", "odometry" or "true": what the observation holds.
-            layout: a maze that is built in, a file or the text of a map or an MJCF, see `layouts`.
-            actions: "three", "steer" or "wheels".
-            hold: simulator steps for which an action is held.
-            max_steps: trial limit in simulator steps.
-            motor_noise: relative half-width of the uniform motor noise, see `MotorNoise`.
-            wheel_noise: "common" or "independent", see `MotorNoise`.
-            dead_reckoning: "guarded", "still" or "literal", see `DeadReckoning`.
-            goal_reward: reward at the goal.
-            collision_reward: reward for a decision that ends in a bump.
-            subgoal_reward: reward for each sub-goal, once a trial.
-            step_reward: reward for every decision.
-            wheel_radius_scale: wheel radius that dead reckoning believes, over the true one.
-            wheel_base_scale: wheel base that dead reckoning believes, over the true one.
-            range_sensors: add 8 infrared ranges and the bumper to the observation.
+            range_sensors: add 8 infrared readings and the bump to the observation.
             render_mode: None, "rgb_array" or "human".
             camera: "top" or "chase".
             width: of the picture in pixels.
             height: of the picture in pixels.
             speed: of the window, times real time.
+            settings: fields of `MazeConfig`: layout, actions, rewards, noise, dead reckoning.
 
         Raises:
-            ValueError: if a setting is unknown or out of range.
+            ValueError: if a setting is of the wrong type or out of range.
+            TypeError: if there is no such setting.
         """
-        pose = choice("pose", pose, ("estimated", "odometry", "true"))
-        actions = choice("actions", actions, tuple(ACTION_NAMES))
-        render_mode = choice("render_mode", render_mode, (None, *self.metadata["render_modes"]))
-        for name, scale in (("radius", wheel_radius_scale), ("base", wheel_base_scale)):
-            if real(f"wheel_{name}_scale", scale) <= 0.0:
-                raise ValueError(f"wheel_{name}_scale must be positive, not {scale}")
+        self.settings = chosen = MazeConfig(**settings)
+        self.pose_mode = choice("pose", pose, ("estimated", "odometry", "true"))
+        self.render_mode = choice(
+            "render_mode", render_mode, (None, *self.metadata["render_modes"])
+        )
         if not isinstance(range_sensors, bool | np.bool_):
             raise ValueError(f"range_sensors must be True or False, not {show(range_sensors)}")
-
-        self.layout = checked("layout", layout)
-        self.physics = Physics(self.layout)
-        self.camera, self.width, self.height = self.physics.check_view(camera, width, height)
-        self.plan = plan = self.physics.plan
+        self.range_sensors = bool(range_sensors)
         self.speed = real("speed", speed)
         if self.speed <= 0.0:
             raise ValueError(f"speed must be positive, not {speed}")
-        self.noise = MotorNoise(motor_noise, wheel_noise)
-        self.estimator = DeadReckoning(
-            dead_reckoning, WHEEL_BASE * float(wheel_base_scale), self.plan.size
-        )
-        self.pose_mode, self.actions, self.render_mode = pose, actions, render_mode
-        self.hold = whole("hold", hold, MAX_HOLD)
-        self.max_steps = whole("max_steps", max_steps)
-        self.goal_reward = real("goal_reward", goal_reward)
-        self.collision_reward = real("collision_reward", collision_reward)
-        self.subgoal_reward = real("subgoal_reward", subgoal_reward)
-        self.step_reward = real("step_reward", step_reward)
-        self.wheel_radius_scale = float(wheel_radius_scale)
-        self.range_sensors = bool(range_sensors)
-        self.action_space = action_space(actions)
+        self.physics = Physics(chosen.layout)
+        self.camera, self.width, self.height = self.physics.check_view(camera, width, height)
+        self.plan = plan = self.physics.plan
+        self.noise = MotorNoise(chosen.motor_noise, chosen.wheel_noise)
+        base = WHEEL_BASE * chosen.wheel_base_scale
+        self.estimator = DeadReckoning(chosen.dead_reckoning, base, plan.size, chosen.right_angles)
+        self.action_space = action_space(chosen.actions)
         # Without its guard an estimate may leave the arena, by at most what a trial can drive.
         free = pose != "true" and not self.estimator.guarded
-        reach = self.max_steps * STEP_SECONDS * FORWARD_SPEED * self.wheel_radius_scale * free
-        self.observation_space = observation_space(plan, reach, self.range_sensors)
+        way = chosen.max_steps * STEP_SECONDS * FORWARD_SPEED * chosen.wheel_radius_scale
+        self.observation_space = observation_space(plan, way * free, self.range_sensors)
         self._aim(0)
 
         self.trial = self.decision = 0  # numbers that the window shows
@@ -160,6 +124,7 @@ class KheperaMazeEnv(gymnasium.Env[np.ndarray, Any]):
         self.done = True
         self.subgoals = [False] * len(plan.subgoals)
         self.trail: list[tuple[float, float]] = []
+        self._senses = np.random.default_rng(0)  # of the noise of the infrared sensors
         self.on_simulator_step: Callable[[], None] | None = None  # e.g. to record each frame
         self._renderer: OffscreenRenderer | Viewer | None = None
 
@@ -175,12 +140,16 @@ class KheperaMazeEnv(gymnasium.Env[np.ndarray, Any]):
         pose = self._start_pose(options or {})
         if self.plan.told:
             self._aim(int(self.np_random.integers(len(self.plan.goals))))
+        # Of their own, so that the robot moves as it would without them.
+        self._senses = np.random.default_rng(self.np_random.bit_generator.state["state"]["state"])
+        self._draws = self._draw(1)
         self.physics.place(pose)
         self.estimator.fix(pose)
         self.trial, self.decision, self.caption = self.trial + 1, 0, ""
         self.total_steps = 0
         self.done = False
         self.subgoals = [False] * len(self.plan.subgoals)
+        self._inside = self._around(pose[:2])
         self.trail = [pose[:2]]
         if self.render_mode == "human":
             self.render()
@@ -198,23 +167,24 @@ class KheperaMazeEnv(gymnasium.Env[np.ndarray, Any]):
         left, right = self.wheel_speeds(action)
         self.decision += 1
         # One draw for a whole decision, however early it ends: fast, and easy to reproduce.
-        draws = iter(self.np_random.random(2 * self.hold).tolist())
-        reward = self.step_reward
+        draws = iter(self.np_random.random(2 * self.settings.hold).tolist())
+        self._draws = self._draw(self.settings.hold + 1)
+        reward = self.settings.step_reward
         steps, bumped, success = 0, False, False
-        limit = min(self.hold, self.max_steps - self.total_steps)
+        limit = min(self.settings.hold, self.settings.max_steps - self.total_steps)
         while steps < limit and not (bumped or success):
             reward_now, bumped, success = self._simulate(left, right, next(draws), next(draws))
             reward += reward_now
             steps += 1
         self.total_steps += steps
-        truncated = self.total_steps >= self.max_steps and not success
+        truncated = self.total_steps >= self.settings.max_steps and not success
         self.done = success or truncated
         info = self._info(steps, bumped, success)
         return self._observation(bumped), reward, success, truncated, info
 
     def wheel_speeds(self, action: Any) -> tuple[float, float]:
         """Return the commanded speeds of the left and right wheel [m/s] for an action."""
-        return commanded(self.actions, action)
+        return commanded(self.settings.actions, action)
 
     def render(self) -> np.ndarray | None:
         """Return the view of the maze as an RGB array (height, width, 3), or update the window.
@@ -229,7 +199,7 @@ class KheperaMazeEnv(gymnasium.Env[np.ndarray, Any]):
             return None
         qpos, estimate = self.physics.data.qpos, self.estimator.pose
         if self._renderer is None:
-            model = load_model(self.layout)
+            model = load_model(self.settings.layout)
             if self.render_mode == "human":
                 self._renderer = Viewer(model, self.speed, self.camera)
             else:
@@ -259,7 +229,7 @@ class KheperaMazeEnv(gymnasium.Env[np.ndarray, Any]):
     @property
     def action_names(self) -> tuple[str, ...]:
         """What the actions are called: one name for each choice, or for each number."""
-        return ACTION_NAMES[self.actions]
+        return ACTION_NAMES[self.settings.actions]
 
     def measure(self, infos: Sequence[dict[str, Any]]) -> dict[str, float]:
         """Return what a trial was like, from the info at its start and of each decision.
@@ -287,6 +257,7 @@ class KheperaMazeEnv(gymnasium.Env[np.ndarray, Any]):
         return goal | {
             "physics": self.physics.state(),
             "generator": self.np_random.bit_generator.state,
+            "senses": self._senses.bit_generator.state,
             "estimate": list(self.estimator.pose),
             "total_steps": self.total_steps,
             "done": self.done,
@@ -297,39 +268,40 @@ class KheperaMazeEnv(gymnasium.Env[np.ndarray, Any]):
         """Continue from a state returned by `state_dict` of an environment built alike."""
         self.physics.set_state(state["physics"])
         self.np_random.bit_generator.state = state["generator"]
+        self._senses.bit_generator.state = state["senses"]
         self.estimator.pose = tuple(state["estimate"])
         self.total_steps = state["total_steps"]
         self.done = state["done"]
         self.subgoals = list(state["subgoals"])
         self.trail = [self.physics.position()]
         self._aim(state.get("goal", 0))
+        self._inside = self._around(self.physics.position())
 
     def _simulate(
         self, left: float, right: float, first: float, second: float
     ) -> tuple[float, bool, bool]:
         """Simulate one step of 0.5 s; return its reward, whether it bumped and reached the goal."""
-        physics, scale = self.physics, self.wheel_radius_scale
+        physics, scale = self.physics, self.settings.wheel_radius_scale
         encoders = physics.wheel_travel() if self.pose_mode == "odometry" else None
         physics.drive(*self.noise.apply(left, right, first, second))
-        bumped = physics.bumped()
-        x, y = physics.position()
+        walls = self._walls(left + right)
+        bumped = bool(walls)
 
         if encoders is None:
             rolled_left, rolled_right = left * STEP_SECONDS, right * STEP_SECONDS
         else:
             now = physics.wheel_travel()
             rolled_left, rolled_right = now[0] - encoders[0], now[1] - encoders[1]
-        walls = physics.wall_bearings() if bumped else ()
         self.estimator.update(rolled_left * scale, rolled_right * scale, walls)
 
-        reward, success = self.collision_reward if bumped else 0.0, False
-        for zone, (centre_x, centre_y, square) in self._zones:
-            dx, dy = x - centre_x, y - centre_y
-            if dx * dx + dy * dy <= square:
-                reward += self._enter(zone)
-                success = success or zone == GOAL
+        reward = self.settings.collision_reward if bumped else 0.0
+        position = physics.position()
+        before, self._inside = self._inside, self._around(position)
+        for zone in self._inside:
+            reward += self._enter(zone, zone not in before)
+        success = GOAL in self._inside
         if self.render_mode is not None:
-            self.trail.append((x, y))
+            self.trail.append(position)
             if self.render_mode == "human":
                 self.render()
         if self.on_simulator_step is not None:
@@ -345,23 +317,51 @@ class KheperaMazeEnv(gymnasium.Env[np.ndarray, Any]):
         zones += [(GOAL, centre, plan.goal_radius) for centre in goals]
         self._zones = [(zone, (*at, r * r)) for zone, at, r in zones if r > 0.0]
 
-    def _enter(self, zone: int) -> float:
+    def _around(self, position: tuple[float, float]) -> list[int]:
+        """Return the zones in which a position lies."""
+        x, y = position
+        zones = []
+        for zone, (centre_x, centre_y, square) in self._zones:
+            dx, dy = x - centre_x, y - centre_y
+            if dx * dx + dy * dy <= square:
+                zones.append(zone)
+        return zones
+
+    def _enter(self, zone: int, entry: bool) -> float:
         """Return the reward inside a zone; correct the estimate at landmarks."""
         if zone == GOAL:
-            return self.goal_reward
+            return self.settings.goal_reward
         new = zone != START and not self.subgoals[zone]
-        if new or self.estimator.guarded:
-            self.estimator.fix(self.physics.pose())
+        told = self.settings.landmarks == "inside" or (
+            zone != START and (new if self.settings.landmarks == "first" else entry)
+        )
+        if told:
+            x, y, heading = self.physics.pose()
+            keeps = self.settings.landmarks == "position"
+            self.estimator.fix((x, y, self.estimator.pose[2] if keeps else heading))
         if new:
             self.subgoals[zone] = True
-        return self.subgoal_reward * new
+        return self.settings.subgoal_reward * new
+
+    def _walls(self, forward: float) -> Sequence[float]:
+        """Return the directions [rad] of the walls that the robot bumps into."""
+        if self.settings.bumps == "contact":
+            return self.physics.wall_bearings() if self.physics.bumped() else ()
+        return felt_walls(self._infrared(), forward) if forward else ()
+
+    def _infrared(self) -> list[float]:
+        noise, draws = self.settings.infrared_noise, next(self._draws)
+        return readings(self.physics.infrared_ranges(), noise, draws)
+
+    def _draw(self, readings: int) -> Iterator[list[float]]:
+        return iter(self._senses.random((readings, len(INFRARED))).tolist())
 
     def _observation(self, bumped: bool) -> np.ndarray:
         pose = self.physics.pose() if self.pose_mode == "true" else self.estimator.pose
         goal = self.plan.goals[self.goal] if self.plan.told else ()
         if not self.range_sensors:
             return np.array([*pose, *goal], dtype=np.float32)
-        return np.array([*pose, *goal, *self.physics.infrared_ranges(), bumped], dtype=np.float32)
+        return np.array([*pose, *goal, *self._infrared(), bumped], dtype=np.float32)
 
     def _info(self, steps: int, bumped: bool, success: bool) -> dict[str, Any]:
         goal = {"goal": np.array(self.plan.goals[self.goal])} if self.plan.told else {}

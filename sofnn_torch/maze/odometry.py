@@ -16,6 +16,8 @@ WHEEL_RADIUS = 0.008  # m
 STEP_LENGTH = FORWARD_SPEED * STEP_SECONDS  # m, one step straight on: 5 mm
 STEP_TURN = 2.0 * TURN_SPEED * STEP_SECONDS / WHEEL_BASE  # rad, one turning step: 0.08 rad
 DRAG = 1.7  # sideways drag of the tyres over that of the drive, of the simulated robot
+ROBOT_RADIUS = 0.0275  # m
+TRUST = 0.3  # share of a heading's error that one felt wall corrects
 
 Pose = tuple[float, float, float]
 
@@ -77,34 +79,46 @@ class MotorNoise:
 
 
 class DeadReckoning:
-    """Pose estimate that adds up wheel movements, with fixes where the robot knows its place.
+    """Pose estimate that adds up wheel movements, and is set right where the robot knows its place.
 
-    `mode="guarded"` (default): in a bumped step the estimate slides along the wall that the robot
-    feels, as the robot does. The estimate stays inside the arena, and it is set to the truth
-    whenever the robot passes a landmark (a sub-goal or the start). `mode="still"`: the same, but
-    a bumped step does not move it. `mode="literal"`, as printed in the paper: it always moves,
-    and is set to the truth only when a sub-goal is found for the first time in a trial.
+    `mode="slide"` (default): in a bumped step the estimate slides along the wall that the robot
+    feels, as the robot does, and it stays inside the arena. `mode="still"`: the same, but a bumped
+    step does not move it. `mode="literal"`, as printed in the paper: it always moves.
+
+    Examples:
+        >>> estimator = DeadReckoning()
+        >>> estimator.fix((0.15, 0.25, 0.0))
+        >>> estimator.update(0.005, 0.005)
+        >>> estimator.pose
+        (0.155, 0.25, 0.0)
     """
 
     def __init__(
-        self, mode: str = "guarded", wheel_base: float = WHEEL_BASE, arena: Sequence[float] = (1, 1)
+        self,
+        mode: str = "slide",
+        wheel_base: float = WHEEL_BASE,
+        arena: Sequence[float] = (1, 1),
+        right_angles: bool = False,
     ) -> None:
         """Start at the origin.
 
         Args:
-            mode: "guarded", "still" or "literal".
+            mode: "slide", "still" or "literal".
             wheel_base: distance between the wheels [m] that the robot believes it has.
-            arena: width and height [m] of the area the estimate may not leave.
+            arena: width and height [m] of the area that the robot does not leave.
+            right_angles: whether walls are known to run along x or y: then the direction of a felt
+                wall tells the heading.
 
         Raises:
             ValueError: if `mode` is unknown or `wheel_base` is not positive.
         """
-        mode = choice("dead_reckoning", mode, ("guarded", "still", "literal"))
+        mode = choice("dead_reckoning", mode, ("slide", "still", "literal"))
         self.wheel_base = real("wheel_base", wheel_base)
         if not self.wheel_base > 0.0:
             raise ValueError(f"wheel_base must be positive, not {wheel_base}")
-        self.guarded, self.slides = mode != "literal", mode == "guarded"
+        self.guarded, self.slides = mode != "literal", mode == "slide"
         self.width, self.height = arena
+        self.right_angles = right_angles
         self.pose: Pose = (0.0, 0.0, 0.0)
 
     def fix(self, pose: Pose) -> None:
@@ -132,8 +146,10 @@ class DeadReckoning:
                 x += along * math.cos(heading) - aside * math.sin(heading)
                 y += along * math.sin(heading) + aside * math.cos(heading)
             heading = wrap_angle(heading + turn)
-        if not (0.0 <= x <= self.width and 0.0 <= y <= self.height):
-            x, y = min(max(x, 0.0), self.width), min(max(y, 0.0), self.height)
+            if self.right_angles:
+                heading = squared(heading, walls[0])
+        r = ROBOT_RADIUS  # its centre comes no nearer to the walls around the arena
+        x, y = min(max(x, r), self.width - r), min(max(y, r), self.height - r)
         self.pose = (x, y, heading)
 
 
@@ -158,6 +174,17 @@ def slide(distance: float, walls: Sequence[float]) -> tuple[float, float]:
             resistance = share + DRAG * (1.0 - share)
             along, aside = along / resistance, aside / resistance
     return along, aside
+
+
+def squared(heading: float, wall: float) -> float:
+    """Return a heading [rad] corrected by a wall along x or y that is felt in a direction [rad].
+
+    A share of the difference, so that the noise of one reading weighs little; what is off by more
+    than 10 degrees is the edge of a wall.
+    """
+    quarter = 0.5 * math.pi
+    error = (heading + wall + 0.5 * quarter) % quarter - 0.5 * quarter
+    return wrap_angle(heading - TRUST * error) if abs(error) < math.radians(10.0) else heading
 
 
 def pose_errors(true: NDArray[np.float64], estimated: NDArray[np.float64]) -> dict[str, float]:

@@ -12,18 +12,8 @@ from sofnn_torch.maze.arguments import choice, whole
 from sofnn_torch.maze.layouts import STANDARD, content, mjcf
 from sofnn_torch.maze.odometry import STEP_SECONDS, WHEEL_RADIUS, Pose, wrap_angle
 from sofnn_torch.maze.plan import MazePlan, heading_of
+from sofnn_torch.maze.sensors import INFRARED, INFRARED_RANGE
 
-INFRARED = (
-    "ir_left_90",
-    "ir_left_45",
-    "ir_left_0",
-    "ir_right_0",
-    "ir_right_45",
-    "ir_right_90",
-    "ir_back_right",
-    "ir_back_left",
-)
-INFRARED_RANGE = 0.1  # m
 STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 
 
@@ -141,14 +131,14 @@ class Physics:
         return left * WHEEL_RADIUS, right * WHEEL_RADIUS
 
     def infrared_ranges(self) -> list[float]:
-        """Return the free distance [m] before each of the 8 infrared sensors, at most 0.1."""
+        """Return the free distance [m] before each of the 8 infrared sensors, at most 0.05."""
         options = self.model.opt
         options.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
         mujoco.mj_kinematics(self.model, self.data)
         mujoco.mj_sensorPos(self.model, self.data)
         options.disableflags |= mujoco.mjtDisableBit.mjDSBL_SENSOR
         ranges = (self.data.sensor(name).data.item() for name in INFRARED)
-        return [distance if distance >= 0.0 else INFRARED_RANGE for distance in ranges]
+        return [min(r, INFRARED_RANGE) if r >= 0.0 else INFRARED_RANGE for r in ranges]
 
     def state(self) -> list[float]:
         """Return all numbers that the simulation's future depends on."""

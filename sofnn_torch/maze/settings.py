@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from sofnn_torch.bounds import Positive, Settings, Within, flag
 from sofnn_torch.maze.layouts import STANDARD
@@ -46,9 +46,20 @@ class MazeConfig(Settings, table="maze"):
     """Motor noise; 0.1 multiplies the forward speed by U(0.9, 1.1) in each step."""
     wheel_noise: Literal["common", "independent"] = "common"
     """One factor for the forward and one for the turning part, or one for each wheel."""
-    dead_reckoning: Literal["guarded", "still", "literal"] = "guarded"
-    """`guarded`: slides along a wall on a bump, inside the arena, reset at every pass of a sub-goal
-    or the start; `still`: the same, but no advance on a bump; `literal`: the paper's."""
+    bumps: Literal["infrared", "contact"] = "infrared"
+    """Where bumps and the direction of the wall come from: `infrared`, the robot's eight sensors;
+    `contact`, the contacts of the simulation, exact."""
+    infrared_noise: Annotated[float, Within(least=0, below=1)] = 0.1
+    """Noise of the infrared sensors; 0.1 multiplies each reading by U(0.9, 1.1)."""
+    landmarks: Literal["pose", "position", "inside", "first"] = "pose"
+    """What the robot learns at a sub-goal: `pose`, where it is and how it heads, on entry;
+    `position`, where it is, on entry; `inside`, its pose at every step there and near the start;
+    `first`, its pose the first time in a trial, as in the paper."""
+    dead_reckoning: Literal["slide", "still", "literal"] = "slide"
+    """What a bump does to the estimated pose: `slide`, it slides along the wall; `still`, it stays;
+    `literal`, it advances as without, also out of the arena, as printed in the paper."""
+    right_angles: bool = True
+    """The robot knows that walls run along x or y: each that it feels corrects its heading."""
     goal_reward: float = 1.0
     """Reward at the goal."""
     collision_reward: float = -1e-4
@@ -69,6 +80,20 @@ class MazeConfig(Settings, table="maze"):
         super().__post_init__()
         text = checked(flag(self.table, "layout"), self.layout)
         object.__setattr__(self, "layout", text)  # the dataclass is frozen
+
+    @classmethod
+    def upgraded(cls, data: dict[str, Any]) -> dict[str, Any]:
+        """Settings of a run that was told its contacts and, inside every landmark, its pose."""
+        mode = data.get("dead_reckoning")
+        if "bumps" in data or "hold" not in data or mode not in ("guarded", "still", "literal"):
+            return data
+        mode, landmarks = {
+            "guarded": ("slide", "inside"),
+            "still": ("still", "inside"),
+            "literal": ("literal", "first"),
+        }[mode]
+        known = {"bumps": "contact", "landmarks": landmarks, "right_angles": False}
+        return data | known | {"dead_reckoning": mode}
 
     @property
     def axes(self) -> tuple[Axis, ...]:

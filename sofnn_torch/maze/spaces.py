@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from sofnn_torch.maze.arguments import show, vector
 from sofnn_torch.maze.odometry import FORWARD_SPEED, TURN_SPEED
 from sofnn_torch.maze.plan import MazePlan
-from sofnn_torch.maze.robot import INFRARED_RANGE
+from sofnn_torch.maze.sensors import INFRARED_RANGE
 
 RIGHT, STRAIGHT, LEFT = range(3)
 ACTION_NAMES = {

@@ -91,7 +91,7 @@ def maze_film(
         RenderingError: this machine cannot draw.
     """
     env = make_maze(config)
-    renderer = OffscreenRenderer(load_model(env.layout), size, size)
+    renderer = OffscreenRenderer(load_model(env.settings.layout), size, size)
     for effect in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
         renderer.scene.flags[effect] = 0  # four fifths of the time where there is no GPU
     trail: list[tuple[float, float]] = []

@@ -115,6 +115,8 @@ def _paper(agent: str) -> dict[str, Any]:
     )
     goal, collision = (100.0, -0.1) if agent == "q" else (1.0, -1e-4)
     maze = MazeConfig(
+        bumps="contact",
+        landmarks="first",
         dead_reckoning="literal",
         goal_reward=goal,
         collision_reward=collision,

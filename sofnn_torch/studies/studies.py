@@ -128,14 +128,32 @@ HELPS: dict[str, dict[str, Arm]] = {
     },
 }
 NETWORK: dict[str, Arm] = {
-    "literal-dead-reckoning": {"maze.dead_reckoning": "literal"},
-    "still-dead-reckoning": {"maze.dead_reckoning": "still"},
     "growth-input": {"net.growth": "input"},
     "growth-literal": {"net.growth": "literal"},
     "theta-times-0.5": {"net.theta": Times(0.5)},
     "theta-times-1.5": {"net.theta": Times(1.5)},
     "width-times-0.7": {"net.width_position": Times(0.7), "net.width_heading": Times(0.7)},
     "width-times-1.4": {"net.width_position": Times(1.4), "net.width_heading": Times(1.4)},
+}
+
+
+# What the robot is told of its pose: each piece of information given or taken away alone.
+TOLD: dict[str, Arm] = {
+    "exact-bumps": {"maze.bumps": "contact"},
+    "exact-infrared": {"maze.infrared_noise": 0.0},
+    "landmarks-position": {"maze.landmarks": "position"},
+    "landmarks-first": {"maze.landmarks": "first"},
+    "landmarks-inside": {"maze.landmarks": "inside"},
+    "no-right-angles": {"maze.right_angles": False},
+    "still": {"maze.dead_reckoning": "still"},
+    "literal": {"maze.dead_reckoning": "literal"},
+    "as-printed": {
+        "maze.bumps": "contact",
+        "maze.landmarks": "first",
+        "maze.dead_reckoning": "literal",
+    },
+    "encoders": {"pose": "odometry"},
+    "true-pose": {"pose": "true"},
 }
 
 
@@ -184,6 +202,13 @@ STUDIES: dict[str, Study] = {
         "What each help and each number brings",
         "One change at a time against the preset `default`, growing network, estimated pose.",
         _variants(NETWORK, HELPS),
+    ),
+    "sensors": Study(
+        "What the robot is told of its pose",
+        "One piece of information given or taken away at a time against the preset `default`, in "
+        "which the robot knows what its wheels were told, what its infrared sensors report, that "
+        "walls stand at right angles, where it starts, and its pose on entering a sub-goal.",
+        _variants(TOLD, {agent: {} for agent in LEARNERS}),
     ),
     "fixed": Study(
         "The fixed network, tuned fairly",
