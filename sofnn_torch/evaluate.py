@@ -209,8 +209,8 @@ def mean(values: Sequence[float], seed: int = 0) -> Estimate:
 
 
 def proportion(successes: int, trials: int) -> Estimate:
-    """Share of successes with its Wilson interval."""
-    interval = stats.binomtest(successes, trials).proportion_ci(CONFIDENCE, method="wilson")
+    """Share of successes with its exact interval (Clopper and Pearson 1934)."""
+    interval = stats.binomtest(successes, trials).proportion_ci(CONFIDENCE, method="exact")
     return Estimate(successes / trials, float(interval.low), float(interval.high))
 
 

@@ -71,9 +71,13 @@ def test_means_without_a_spread_claim_no_more_than_they_know(values):
         assert math.isnan(estimate.low)
 
 
-def test_wilson_interval_of_nine_in_ten():
-    estimate = evaluate.proportion(9, 10)  # Wilson's formula with z = 1.95996
-    assert dataclasses.astuple(estimate) == pytest.approx((0.9, 0.5958, 0.9821), abs=1e-4)
+def test_the_interval_of_nine_in_ten_is_exact():
+    estimate = evaluate.proportion(9, 10)
+    assert dataclasses.astuple(estimate) == pytest.approx((0.9, 0.5550, 0.9975), abs=1e-4)
+    for share, most in ((estimate.low, 1), (estimate.high, 9)):  # each tail is 2.5 %
+        counts = [k for k in range(11) if (k >= 9) == (most == 1)] + [9] * (most == 9)
+        tail = sum(math.comb(10, k) * share**k * (1 - share) ** (10 - k) for k in set(counts))
+        assert tail == pytest.approx(0.025, abs=1e-9)
 
 
 def test_steps_to_the_goal_leave_out_the_trials_that_missed_it():

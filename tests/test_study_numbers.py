@@ -29,7 +29,7 @@ USUAL = {
 }
 
 
-def study(arms, name="section5", seeds=4, **tables):
+def study(arms, name="section5", seeds=5, **tables):
     """Data of a study in which all seeds of an arm are alike: what differs from `USUAL` by arm."""
     rows = [
         {"arm": arm, "seed": seed} | USUAL | changes
@@ -38,7 +38,7 @@ def study(arms, name="section5", seeds=4, **tables):
     ]
     config = {"maze": {"max_steps": LIMIT}, "trials": 100}
     kept = {"changes": "", "seeds": [*range(seeds)], "config": config}
-    info = {"study": name, "optimum": OPTIMUM, "arms": dict.fromkeys(arms, kept)}
+    info = {"study": name, "optimum": OPTIMUM, "episodes": 100, "arms": dict.fromkeys(arms, kept)}
     return results.Data(info, rows, tables)
 
 
@@ -122,7 +122,8 @@ def test_the_closing_table_has_both_policies():
     ("changes", "reached"),
     [
         ({}, "yes yes yes yes"),
-        ({"greedy_success": 0.98}, "no yes yes yes"),
+        ({"greedy_success": 0.99}, "[cannot tell] yes yes yes"),
+        ({"greedy_success": 0.9}, "no yes yes yes"),
         ({"greedy_steps": 516.1}, "yes no no yes"),
         ({"trials_to_learn": 51}, "yes yes yes no"),
         ({"trials_to_learn": math.nan, "trials": 30}, "yes yes yes no"),
@@ -131,7 +132,8 @@ def test_the_closing_table_has_both_policies():
 )
 def test_goals_are_of_the_greedy_policy(changes, reached):
     data = study({"sga-sofnn-estimated": changes})
-    assert " ".join(yes for *_, yes in claims.goals(data)) == reached
+    found = (yes if " " not in yes else f"[{yes}]" for *_, yes in claims.goals(data))
+    assert " ".join(found) == reached
 
 
 def test_a_goal_within_1_10_of_the_optimum_is_not_within_1_12():
@@ -187,14 +189,14 @@ def test_each_column_of_the_main_table_is_what_its_head_says():
     head, row = ([cell.strip() for cell in line.split("|")[1:-1]] for line in (table[0], table[3]))
     assert dict(zip(head, row, strict=True)) == {
         "arm": "sga-other",
-        "seeds": "4",
+        "seeds": "5",
         "arriving": "0",
         "trials to learn": "33",
-        "success, greedy [%]": "90.0",
+        "success, greedy [%]": "90.0 (87.0 to 92.5)",
         "steps, greedy": "600",
         "over the optimum": "1.28",
         "over the default": "1.50",
-        "success, sampled [%]": "80.0",
+        "success, sampled [%]": "80.0 (76.2 to 83.4)",
         "steps, sampled": "700",
         "collisions a trial": "2.5",
         "rules": "1,234",
@@ -209,14 +211,16 @@ def condition(seed, policy, success, steps):
 def test_conditions_are_tabled_for_the_greedy_policy():
     rows = [
         condition(seed, "greedy", success, steps)
-        for seed, (success, steps) in enumerate([(1, 400), (1, 500), (0.7, 900)])
+        for seed, (success, steps) in enumerate(
+            [(1, 400), (1, 500), (0.7, 900), (1, 400), (1, 600)]
+        )
     ]
-    rows += [condition(seed, "sampled", 0.1, 2000) for seed in range(3)]
+    rows += [condition(seed, "sampled", 0.1, 2000) for seed in range(5)]
     data = study({"q-sofnn-estimated": {}}, "robustness", conditions=rows)
     line = report.condition_table(data).splitlines()[-1]
     _, noise, success, steps, _ = (cell.strip() for cell in line.split("|"))
     assert noise == "motor noise 10 [%]"
-    assert success.startswith("90 (") and steps.startswith("500 (")
+    assert success.startswith("94 (") and steps == "500 (400 to 900)"
 
 
 def test_conditions_are_drawn_for_the_greedy_policy():
@@ -243,22 +247,9 @@ def test_arms_of_equal_settings_and_seeds_are_shown_once():
 # --------------------------------------------------------------------------------- statistics
 
 
-def test_ratios_are_of_medians_and_means_are_means():
-    skewed, even = np.array([1.0, 1.0, 10.0]), np.array([2.0, 2.0, 2.0])
-    assert results.ratio(skewed, even).value == 0.5
-    assert results.mean(skewed).value == 4 and results.median(skewed).value == 1
-
-
-def test_the_interval_of_a_mean_of_many_is_that_of_a_normal_distribution():
-    data = np.random.default_rng(3).normal(0, 1, 900)
-    estimate = results.mean(data)
-    half = 1.96 * data.std() / math.sqrt(len(data))
-    assert (estimate.high - estimate.low) / 2 == pytest.approx(half, rel=0.06)
-
-
 def test_a_run_that_never_learns_counts_as_one_trial_more_than_it_had():
     data = study({"q-x": {"trials_to_learn": math.nan, "trials": 60}})
-    assert results.censored(data, "q-x").tolist() == [61] * 4
+    assert results.censored(data, "q-x").tolist() == [61] * 5
 
 
 # ------------------------------------------------------------------------------- collected data

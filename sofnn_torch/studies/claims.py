@@ -6,12 +6,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sofnn_torch.evaluate import Estimate, proportion
 from sofnn_torch.maze.robot import plan_of
 from sofnn_torch.studies.drawing import AGENTS, NETWORKS, last_paths
-from sofnn_torch.studies.results import Data, cell, censored, learned_after, mean, median, ratio
+from sofnn_torch.studies.results import Data, cell, censored, learned_after, success
+from sofnn_torch.studies.statistics import (
+    FAILS,
+    HOLDS,
+    OPEN,
+    Measured,
+    judge,
+    median,
+    proportion,
+    ratio,
+    verdicts,
+)
 
-HOLDS, FAILS, OPEN = "holds", "does not hold", "cannot tell"
 PRINTED = {  # steps after learning, rules of SOFNN, rules of FSFNN (printed the other way round)
     "sga": (515.9, 912, 1152),
     "q": (528.9, 10024, 9216),
@@ -23,20 +32,18 @@ LAST = 10  # training trials at the end that say whether a seed arrives
 SAME = (0.9, 1.1)  # ratios in between count as equal
 RESET = 0.003  # m, largest error after a decision in which a position estimate was corrected
 
+NOTHING = Measured(float("nan"))
+REACHED = {HOLDS: "yes", FAILS: "no", OPEN: "cannot tell"}
 HOW = """\
-A claim *holds* if the whole 95 % interval of what we measured agrees with the criterion, it *does
-not hold* if the whole interval contradicts it, and otherwise we *cannot tell*. A seed *arrives* if
-at least 9 of its last 10 training trials end at the goal (what Figs 7 and 8 show); intervals of
-shares of seeds are Wilson's, those of ratios of medians a percentile bootstrap over seeds."""
-
-
-def judge(measured: Estimate, low: float, high: float) -> str:
-    """Whether an interval lies inside [low, high], outside, or neither."""
-    if low <= measured.low and measured.high <= high:
-        return HOLDS
-    if measured.high < low or measured.low > high:
-        return FAILS
-    return OPEN
+A claim *holds* if the whole interval of what we measured agrees with the criterion, it *does not
+hold* if the whole interval contradicts it, and otherwise we *cannot tell*. The intervals shown are
+of 95 % each; the verdicts are together right with 95 % confidence (Holm's method). A seed *arrives*
+if at least 9 of its last 10 training trials end at the goal (what Figs 7 and 8 show); intervals of
+shares are exact (Clopper and Pearson), those of ratios of medians a percentile bootstrap over
+seeds."""
+GOALS = """\
+A goal is reached if the whole 95 % interval reaches it. Each verdict is single, not corrected for
+their number."""
 
 
 def arriving(data: Data, arm: str) -> tuple[int, int]:
@@ -74,8 +81,15 @@ def _distances(poses: NDArray[Any], point: tuple[float, float]) -> NDArray[np.fl
     return np.hypot(*(begin + share[:, None] * way - point).T)
 
 
-def claims(data: Data) -> Iterator[tuple[str, str, str, str]]:
+def claims(data: Data) -> list[tuple[str, str, str, str]]:
     """Rows: claim, criterion, what we measured, verdict."""
+    rows = list(_claims(data))
+    found = verdicts([(measured, *bounds) for _, _, _, measured, bounds in rows])
+    return [(*row[:3], verdict) for row, verdict in zip(rows, found, strict=True)]
+
+
+def _claims(data: Data) -> Iterator[tuple[str, str, str, Measured, tuple[float, float]]]:
+    """Claim, criterion, what we measured in words and numbers, and where it must lie."""
     known = set(data.info["arms"])
     for number, (agent, title) in zip((7, 8), AGENTS.items(), strict=True):
         for network, text, share in (
@@ -90,7 +104,8 @@ def claims(data: Data) -> Iterator[tuple[str, str, str, str]]:
                     f"Fig. {number}, {title}: {text}",
                     f"{'more' if share[1] == 1 else 'less'} than half of the seeds arrive",
                     data.remark(f"{arrived} of {seeds} seeds ({interval})", arm),
-                    judge(measured, *share),
+                    measured,
+                    share,
                 )
         arms = [f"{agent}-{network}-estimated" for network in ("sofnn", "fixed")]
         if known.issuperset(arms):
@@ -99,7 +114,8 @@ def claims(data: Data) -> Iterator[tuple[str, str, str, str]]:
                 f"Fig. {number}, {title}: SOFNN learns in fewer trials than FSFNN (implied)",
                 "ratio of median trials to learn below 1",
                 data.remark(cell(measured, 2), *arms),
-                OPEN if measured.low == measured.high == 1 else judge(measured, 0, 1 - 1e-9),
+                NOTHING if measured.low == measured.high == 1 else measured,  # neither learns
+                (0, 1 - 1e-9),
             )
     sofnn = {agent: f"{agent}-sofnn-estimated" for agent in AGENTS}
     if known.issuperset(sofnn.values()):
@@ -108,7 +124,8 @@ def claims(data: Data) -> Iterator[tuple[str, str, str, str]]:
             "Fig. 9: Q-learning grows many more rules than SGA (10024 and 912: 11 times)",
             "ratio of median rules above 2",
             data.remark(cell(measured, 2), *sofnn.values()),
-            judge(measured, 2, np.inf),
+            measured,
+            (2, np.inf),
         )
     for agent, title in AGENTS.items():
         arms = [f"{agent}-sofnn-{pose}" for pose in ("estimated", "true")]
@@ -118,7 +135,8 @@ def claims(data: Data) -> Iterator[tuple[str, str, str, str]]:
                 f"Fig. 10, {title}: the estimated pose does as well as the true one (implied)",
                 "ratio of median steps, sampled, in 0.9 to 1.1",
                 data.remark(cell(measured, 2), *arms),
-                judge(measured, *SAME),
+                measured,
+                SAME,
             )
     for agent, title in AGENTS.items():
         if sofnn[agent] in known:
@@ -130,7 +148,8 @@ def claims(data: Data) -> Iterator[tuple[str, str, str, str]]:
                 f"Fig. 11, {title}: on the way to the goal the error is reset to 0 two times",
                 "at both sub-goals, on more than half of the paths of the last trial",
                 text,
-                judge(proportion(twice, paths), 0.5, 1) if paths else OPEN,
+                proportion(twice, paths),
+                (0.5, 1),
             )
     if known.issuperset(sofnn.values()):
         measured = ratio(*(data.column(sofnn[agent], "sampled_steps") for agent in AGENTS))
@@ -138,7 +157,8 @@ def claims(data: Data) -> Iterator[tuple[str, str, str, str]]:
             "Text: both may have the same performance (515.9 and 528.9 steps: 0.98)",
             "ratio of median steps of SGA and Q, sampled, in 0.9 to 1.1",
             data.remark(cell(measured, 2), *sofnn.values()),
-            judge(measured, *SAME),
+            measured,
+            SAME,
         )
 
 
@@ -166,23 +186,27 @@ def goals(data: Data) -> Iterator[tuple[str, str, str, str]]:
         arm = f"{agent}-sofnn-estimated"
         if arm not in data.info["arms"]:
             continue
-        steps = median(data.column(arm, "greedy_steps"))
-        success = mean(data.column(arm, "greedy_success"))
-        learned = learned_after(data, arm)
+        steps, learned = median(data.column(arm, "greedy_steps")), learned_after(data, arm)
+        arrived = success(data, arm, "greedy")
         optimum, trials = data.info["optimum"], data.column(arm, "trials")[0]
         most = {"sga": 516, "q": 529}[agent]
-        for text, measured, reached in (
-            ("success at least 99 %", f"{cell(success, 1, 100)} %", success.value >= 0.99),
-            (f"steps at most {most}", cell(steps, 1), steps.value <= most),
+        for text, said, measured, *bounds in (
+            ("success at least 99 %", f"{cell(arrived, 1, 100)} %", arrived, 0.99, 1),
+            (f"steps at most {most}", cell(steps, 1), steps, 0, most),
             (
                 "steps within 1.10 of the optimum",
                 cell(steps, 3, 1 / optimum),
-                steps.value <= 1.1 * optimum,
+                steps,
+                0,
+                1.1 * optimum,
             ),
             (
                 "trials to learn at most 50",
                 cell(learned, limit=trials),
-                learned.value <= min(50, trials),
+                learned,
+                0,
+                min(50, trials),
             ),
         ):
-            yield title, text, data.remark(measured, arm), "yes" if reached else "no"
+            verdict = REACHED[judge(measured, *bounds)]
+            yield title, text, data.remark(said, arm), verdict

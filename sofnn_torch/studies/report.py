@@ -7,27 +7,22 @@ from typing import Any
 import numpy as np
 
 from sofnn_torch.studies import drawing
-from sofnn_torch.studies.claims import HOW, SWAPPED, arriving, claims, closing_table, goals
+from sofnn_torch.studies.claims import GOALS, HOW, SWAPPED, arriving, claims, closing_table, goals
 from sofnn_torch.studies.drawing import AGENTS
-from sofnn_torch.studies.results import (
-    Data,
-    cell,
-    learned_after,
-    markdown,
-    mean,
-    median,
-    ratio,
-    read,
-)
+from sofnn_torch.studies.results import Data, cell, learned_after, markdown, read, success
+from sofnn_torch.studies.robustness import EPISODES
+from sofnn_torch.studies.statistics import median, ratio, share
 from sofnn_torch.studies.studies import STUDIES
 from sofnn_torch.terminal import say
 
 NOTES = """\
 Cells are medians over the seeds, with the 95 % interval of a percentile bootstrap over seeds in
-brackets; success is the mean over the seeds. *Arriving* is the number of seeds for which at least
-9 of the last 10 training trials ended at the goal. *Trials to learn* is the trial that completes
-the first {in_a_row} in a row under {within} times the optimum (in training, so exploration
-included); a run where that never happens counts as more than its number of trials. What was
+brackets; of fewer than five seeds, which no interval describes, the values themselves. Success is
+the share of all trials with its exact interval, wider where the seeds differ (Korn and Graubard).
+*Arriving* is the number of seeds for which at least 9 of the last 10 training trials ended
+at the goal. *Trials to learn* is the trial that completes the first {in_a_row} in a row under
+{within} times the optimum (in training, so exploration included); a run where that never happens
+counts as more than its number of trials. What was
 learned is then played for {episodes} trials without learning: *greedy* is the mean action (SGA) or
 the best one (Q), *sampled* the stochastic policy of the training; both gain chance where they run
 in [circles](../paper.md#what-plays-in-an-evaluation-and-loops). A trial that fails counts with its
@@ -37,9 +32,9 @@ DIVERGED = """\
 A seed *diverged* if its numbers left all bounds, where the training stops. It counts as one that
 never reaches the goal, with the rules of its last whole trial; an arm of nothing else shows `-`."""
 CONDITION_NOTES = """\
-Greedy policy, 10 trials for each seed; mean success and median steps over the seeds, with 95 %
-intervals. The robot is told the pose that it starts from, scattered or not, as at every pass of
-the start. The sampled policy is in the data."""
+Greedy policy, 10 trials for each seed; success is the share of all trials, steps are medians over
+the seeds, with 95 % intervals; of fewer than five seeds the values themselves. The robot is told
+the pose that it starts from, scattered or not. The sampled policy is in the data."""
 
 
 def arm_table(data: Data, arms: Sequence[str]) -> str:
@@ -67,7 +62,7 @@ def arm_table(data: Data, arms: Sequence[str]) -> str:
             continue
         row += [
             cell(learned_after(data, arm), limit=data.column(arm, "trials")[0]),
-            cell(mean(data.column(arm, "greedy_success")), 1, 100),
+            cell(success(data, arm, "greedy"), 1, 100),
             cell(median(greedy)),
             cell(median(greedy), 2, 1 / data.info["optimum"]),
         ]
@@ -75,7 +70,7 @@ def arm_table(data: Data, arms: Sequence[str]) -> str:
             compared = ratio(greedy, data.column(base, "greedy_steps"))
             row.append(cell(compared, 2) if arm != base else "1")
         row += [
-            cell(mean(data.column(arm, "sampled_success")), 1, 100),
+            cell(success(data, arm, "sampled"), 1, 100),
             cell(median(data.column(arm, "sampled_steps"))),
             cell(median(data.column(arm, "sampled_collisions")), 1),
             cell(median(data.column(arm, "rules"))),
@@ -132,7 +127,7 @@ def page(out: Path, data: Data) -> str:
         if (out / "fixed.csv").exists():
             parts += ["What else was tried for FSFNN: [the search over its settings](fixed.md)."]
         parts += ["## What was to be reached (greedy policy)"]
-        parts += [markdown(["learner", "goal", "measured", "reached"], goals(data), 4)]
+        parts += [markdown(["learner", "goal", "measured", "reached"], goals(data), 4), GOALS]
     if study.conditions and "conditions" in data.tables:
         parts += ["## In other conditions", condition_table(data), CONDITION_NOTES]
     captions = drawing.draw(out, data)
@@ -165,8 +160,9 @@ def condition_table(data: Data) -> str:
                 if (row["arm"], row["group"], row["value"]) == (arm, group, value)
                 and row["policy"] == "greedy"
             ]
-            success, steps = (np.array([row[q] for row in chosen]) for q in ("success", "steps"))
-            line += [f"{cell(mean(success), 0, 100)} %", cell(median(steps))]
+            shares, steps = (np.array([row[q] for row in chosen]) for q in ("success", "steps"))
+            arrived = share(np.rint(shares * EPISODES), EPISODES)
+            line += [f"{cell(arrived, 0, 100)} %", cell(median(steps))]
         lines.append(line)
     return markdown(head, lines)
 

@@ -1,22 +1,20 @@
-"""The data of a study in memory, statistics over its seeds, and tables in Markdown."""
+"""The data of a study in memory, what is told of its arms, and tables in Markdown."""
 
 import csv
 import io
 import json
 import math
-import warnings
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 
-from sofnn_torch.evaluate import CONFIDENCE, Estimate
 from sofnn_torch.maze.layouts import STANDARD
 from sofnn_torch.numerals import decimal
+from sofnn_torch.studies.statistics import Measured, median, share
 
 
 @dataclass(frozen=True)
@@ -105,52 +103,7 @@ def write_table(path: Path, rows: Sequence[dict[str, Any]]) -> None:
     path.write_text(buffer.getvalue())
 
 
-# ------------------------------------------------------------------------------- statistics
-
-
-def bootstrap(
-    samples: Sequence[NDArray[Any]], statistic: Callable[..., Any], seed: int = 0
-) -> Estimate:
-    """A statistic of independent samples with its percentile interval; NaN if one is empty."""
-    if not all(map(len, samples)):
-        return Estimate(math.nan, math.nan, math.nan)
-    value = float(statistic(*samples))
-    if all(len(sample) == 1 for sample in samples):
-        return Estimate(value, math.nan, math.nan)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # equal values make a degenerate distribution
-        interval = stats.bootstrap(
-            # SciPy refuses samples of one, which say nothing of spread; doubled they are the same.
-            [np.repeat(s, 2) if len(s) == 1 else s for s in samples],
-            statistic,
-            paired=False,
-            method="percentile",
-            confidence_level=CONFIDENCE,
-            rng=np.random.default_rng(seed),
-        ).confidence_interval
-    return Estimate(value, float(interval.low), float(interval.high))
-
-
-def median(values: NDArray[Any]) -> Estimate:
-    """Median with its interval."""
-    return bootstrap([values], np.median)
-
-
-def mean(values: NDArray[Any]) -> Estimate:
-    """Mean with its interval."""
-    return bootstrap([values], np.mean)
-
-
-def ratio(above: NDArray[Any], below: NDArray[Any]) -> Estimate:
-    """Ratio of two medians with its interval."""
-
-    def statistic(a: NDArray[Any], b: NDArray[Any], axis: int = -1) -> Any:
-        return np.median(a, axis=axis) / np.median(b, axis=axis)
-
-    return bootstrap([above, below], statistic)
-
-
-def learned_after(data: Data, arm: str) -> Estimate:
+def learned_after(data: Data, arm: str) -> Measured:
     """Median trials to learn; runs that never learn count as one more than their trials."""
     return median(censored(data, arm))
 
@@ -159,6 +112,12 @@ def censored(data: Data, arm: str) -> NDArray[np.float64]:
     """Trials to learn with one more than all trials for never: medians stay what they are."""
     values, limits = data.column(arm, "trials_to_learn"), data.column(arm, "trials")
     return np.where(np.isnan(values), limits + 1, values)
+
+
+def success(data: Data, arm: str, policy: str) -> Measured:
+    """Share of the evaluation trials of all seeds that reached the goal."""
+    episodes = data.info["episodes"]
+    return share(np.rint(data.column(arm, f"{policy}_success") * episodes), episodes)
 
 
 # --------------------------------------------------------------------------------- Markdown
@@ -170,16 +129,21 @@ def markdown(head: Sequence[str], rows: Iterable[Sequence[str]], texts: int = 1)
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
-def cell(estimate: Estimate, digits: int = 0, factor: float = 1, limit: float = math.inf) -> str:
-    """An estimate with its interval; above the limit it is only known to be more."""
+def cell(measured: Measured, digits: int = 0, factor: float = 1, limit: float = math.inf) -> str:
+    """A number with its interval, or the values of seeds that are too few for one.
+
+    Above the limit a number is only known to be more.
+    """
 
     def show(value: float) -> str:
         if factor * value > limit:
             return f"> {limit:,.{digits}f}"
         return f"{factor * value + 1e-9:,.{digits}f}"  # halves go up, not to the even number
 
-    if math.isnan(estimate.value):
+    if math.isnan(measured.value):
         return "-"
-    if math.isnan(estimate.low) or estimate.low == estimate.high:
-        return show(estimate.value)
-    return f"{show(estimate.value)} ({show(estimate.low)} to {show(estimate.high)})"
+    if len(measured.values) > 1:
+        return "; ".join(map(show, measured.values))
+    if math.isnan(measured.low) or measured.low == measured.high:
+        return show(measured.value)
+    return f"{show(measured.value)} ({show(measured.low)} to {show(measured.high)})"

@@ -27,7 +27,7 @@ from sofnn_torch.runs.trial import Trajectory, TrialRecord
 from sofnn_torch.studies.robustness import under_conditions
 from sofnn_torch.studies.studies import STUDIES, essence, settings
 
-EPISODES = 10  # evaluation trials of a run, for each policy
+EPISODES = 20  # evaluation trials of a run, for each policy
 PLAYED = "played-with.json"  # versions of the software, and the processor
 WORK = "import sys; from sofnn_torch.studies.running import work; sys.exit(work(*sys.argv[1:]))"
 
