@@ -35,6 +35,7 @@ Examples:
   train.py --resume runs/sga-sofnn-estimated-s0  go on where a run stopped
   train.py --settings best.toml --trials 300   settings from a file, one of them changed
   train.py --seeds 0-7 --workers 2             eight runs, two at a time
+  train.py --seeds 0-99 --cluster tcp://host:8786  on the workers of a Dask cluster
 
 Ctrl-C saves. Watch with: tensorboard --logdir runs
 """
@@ -55,12 +56,16 @@ class Flags(Settings):
     """Train several seeds, each in its own process and run: `0-7` or `0,3,5`."""
     workers: Count = 1
     """Seeds that are trained at the same time (with `--seeds`)."""
+    cluster: Annotated[str | None, tyro.conf.arg(metavar="WHERE")] = None
+    """Train the seeds on a Dask cluster: the address of its scheduler, as in `tcp://host:8786`, or
+    `slurm` for `--workers` workers of a Slurm cluster (docs/scale.md)."""
     again: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Play the trial again that follows a saved state, such as a `divergence-12.pt`."""
 
 
 MOST_USED = (  # what --help shows
-    "env agent network pose preset seed trials maze.layout settings resume seeds workers name quiet"
+    "env agent network pose preset seed trials maze.layout settings resume seeds workers cluster "
+    "name quiet"
 ).split()
 FAILURES = {ValueError: 2, Divergence: 1, OSError: 1}
 
@@ -77,7 +82,9 @@ def _train(argv: list[str]) -> int:
         training.play_again(flags.again)
         return 0
     if flags.seeds is not None:
-        return parallel.train(flags.config, flags.options, flags.seeds, flags.workers, argv)
+        return parallel.train(
+            flags.config, flags.options, flags.seeds, flags.workers, flags.cluster
+        )
     if flags.resume:
         run = training.resume(flags.resume, flags.options, flags.config.trials)
     else:
@@ -179,7 +186,11 @@ def _refuse_idle(flags: Flags, base: Flags) -> None:
     alone = Flags(Config(), RunOptions(), again=flags.again)
     if flags.again and (others := _changes(flags, alone)):
         raise ValueError(f"{_flag(others[0])} has no effect with --again")
-    idle = flags.config.idle() | ({} if flags.seeds is not None else {"workers": "without --seeds"})
+    idle = flags.config.idle()
+    if flags.seeds is None:
+        idle |= dict.fromkeys(("workers", "cluster"), "without --seeds")
+    elif flags.cluster not in (None, parallel.SLURM):
+        idle |= {"workers": f"with --cluster {flags.cluster}, which has the workers it has"}
     for name in _changes(flags, base):
         if why := why_idle(idle, name):
             raise ValueError(f"{_flag(name)} has no effect {why}")

@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 
 from sofnn_torch import cli, terminal, training
 from sofnn_torch.cli import main, parse
-from sofnn_torch.runs import checkpoint, parallel
+from sofnn_torch.runs import checkpoint, jobs, parallel
 from sofnn_torch.runs.directory import load_config
 from sofnn_torch.runs.factory import make_agent
 from sofnn_torch.runs.settings import Config, from_dict
@@ -271,6 +271,12 @@ def test_growth_without_end_stops_at_the_limit_and_says_so(agent, here, capsys):
         ("--preset paper --sga.rate-value 2", "has no effect without a learned baseline"),
         ("--sga.replays 0 --sga.memory 9", "--sga.memory has no effect with --sga.replays 0"),
         ("--workers 2", "--workers has no effect without --seeds"),
+        ("--cluster slurm", "--cluster has no effect without --seeds"),
+        (
+            "--seeds 0-3 --workers 2 --cluster tcp://a:1",
+            "--workers has no effect with --cluster tcp",
+        ),
+        ("--seeds 0-3 --cluster sulrm", "--cluster must be slurm or the address"),
         ("--again x --agent q --trials 5", "--agent has no effect with --again"),
         ("--again x --trials 5", "--trials has no effect with --again"),
         ("--again x --seeds 0-3", "--seeds has no effect with --again"),
@@ -365,15 +371,15 @@ def test_several_seeds_in_one_call(here, capsys):
 
 def test_a_crash_of_one_seed_leaves_the_others(here, capsys, monkeypatch):
     """The process of one seed is killed as soon as its run is there."""
-    real = parallel.subprocess.Popen
+    real = jobs.subprocess.Popen
 
     def popen(command, **keywords):
         child = real(command, **keywords)
-        if command[command.index("--seed") + 1] == "1":
+        if command[-1].endswith("-s1"):
             child.kill()
         return child
 
-    monkeypatch.setattr(parallel.subprocess, "Popen", popen)
+    monkeypatch.setattr(jobs.subprocess, "Popen", popen)
     assert main(["--seeds", "0-1", "--workers", "2", "--trials", "1", *QUICK]) == 1
     out, err = capsys.readouterr()
     assert out == "runs/sga-sofnn-estimated-s0: done\n"
@@ -390,7 +396,7 @@ def test_a_signal_stops_all_seeds_after_saving(here):
         text=True,
     )
     run = Path("runs/sga-sofnn-estimated-s0")
-    deadline = time.monotonic() + 60
+    deadline = time.monotonic() + 300
     while not (run / "trials.csv").exists() and time.monotonic() < deadline:
         time.sleep(0.1)
     child.send_signal(signal.SIGTERM)

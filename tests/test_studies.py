@@ -39,7 +39,7 @@ def job(tmp_path, name="run", conditions=False, **changes):
 
 def done(work):
     """Do a job in this process, as the child would."""
-    return running.work(*running._command(work)[3:])
+    return running.work(work.path, running._process(work).arguments)
 
 
 # ------------------------------------------------------------------------------------ studies
@@ -155,9 +155,10 @@ def test_the_last_trial_is_played_again_to_the_bit(tmp_path):
 
 
 def test_a_crash_is_reported_and_the_others_finish(tmp_path, monkeypatch, capsys):
-    script = "import os, pathlib, sys; p = pathlib.Path(sys.argv[1]); p.mkdir(parents=True); "
-    script += "p.name == 'b' and os.abort(); (p / 'evaluation.json').write_text('')"
-    monkeypatch.setattr(running, "WORK", script)
+    script = "import os\ndef work(path, *_):\n path.mkdir()\n if path.name == 'b': os.abort()\n"
+    (tmp_path / "aborts.py").write_text(f"{script} (path / 'evaluation.json').touch()")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(running, "WORK", "aborts:work")
     jobs = [job(tmp_path, name) for name in "abc"]
     assert running.execute(jobs, workers=1) == 1
     assert [work.done() for work in jobs] == [True, False, True]
@@ -173,7 +174,7 @@ def test_what_cannot_be_done_is_one_line(tmp_path, capsys):
 
 
 def test_a_divergence_is_a_result(tmp_path, monkeypatch):
-    def diverges(config, options):
+    def diverges(config, options, after):
         (options.runs / options.name).mkdir()
         raise Divergence("trial 1 diverged")
 

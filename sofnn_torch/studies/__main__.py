@@ -13,7 +13,9 @@ import dataclasses
 import signal
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
+
+import tyro
 
 if __name__ == "__main__":  # Ctrl-C while libraries load: there is nothing to save yet
     signal.signal(signal.SIGINT, signal.SIG_DFL)
@@ -41,6 +43,9 @@ class Options(Settings):
     """Seeds of every arm, such as `0-9` (the default) or `0,3,5`."""
     workers: Count = 2
     """Runs at the same time, each in a process of its own on one core."""
+    cluster: Annotated[str | None, tyro.conf.arg(metavar="WHERE")] = None
+    """Train on a Dask cluster, as `--cluster` of `train.py`: `tcp://host:8786`, whose workers are
+    all used, or `slurm` (docs/scale.md)."""
     trials: Count | None = None
     """Trials of every run; by default those of the presets."""
     max_steps: Count | None = None
@@ -119,7 +124,7 @@ def run(options: Options) -> int:
     jobs = running.plan(asked.runs, asked.study, asked.arms, numbers, changes)
     if not jobs:
         raise ValueError(f"--arms {asked.arms}: no arm of {', '.join(asked.study)} has that")
-    failed = running.execute(jobs, asked.workers)
+    failed = running.execute(jobs, asked.workers, asked.cluster)
     optimum = mean_optimum(plan_of(str(changes.get("maze.layout", STANDARD))))
     for name in asked.study:
         notes = {"command": command(name, asked), "quick": asked.quick, "optimum": optimum}

@@ -11,14 +11,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from joblib import Parallel, delayed
-
 from sofnn_torch import evaluate, training
 from sofnn_torch.pictures.figures import read_column
 from sofnn_torch.progress import Progress, say
-from sofnn_torch.runs import checkpoint, directory, session
+from sofnn_torch.runs import checkpoint, directory, jobs, session
 from sofnn_torch.runs.guard import Divergence
-from sofnn_torch.runs.parallel import watch
+from sofnn_torch.runs.parallel import together
 from sofnn_torch.runs.provenance import versions
 from sofnn_torch.runs.session import arithmetic
 from sofnn_torch.runs.settings import Config, from_dict
@@ -29,7 +27,7 @@ from sofnn_torch.studies.studies import STUDIES, essence, settings
 
 EPISODES = 20  # evaluation trials of a run, for each policy
 PLAYED = "played-with.json"  # versions of the software, and the processor
-WORK = "import sys; from sofnn_torch.studies.running import work; sys.exit(work(*sys.argv[1:]))"
+WORK = "sofnn_torch.studies.running:work"
 
 
 @dataclass(frozen=True)
@@ -74,22 +72,22 @@ def plan(
         changes: settings that are changed in every arm.
     """
     existing = find_runs(parent)
-    jobs: dict[Config, Job] = {}
+    planned: dict[Config, Job] = {}
     for name in studies:
-        study, taken = STUDIES[name], {job.path for job in jobs.values()}
+        study, taken = STUDIES[name], {job.path for job in planned.values()}
         for seed, (arm, entries) in itertools.product(numbers, study.arms.items()):
             if only not in arm:
                 continue
             config = settings({**entries, **changes}, seed)
             key = essence(config)
-            if key in jobs:
-                conditions = jobs[key].conditions or study.conditions
-                jobs[key] = dataclasses.replace(jobs[key], conditions=conditions)
+            if key in planned:
+                conditions = planned[key].conditions or study.conditions
+                planned[key] = dataclasses.replace(planned[key], conditions=conditions)
                 continue
             path = existing.get(key) or _free(parent / f"{name}-{arm}-s{seed}", taken)
             taken.add(path)
-            jobs[key] = Job(path, config, study.conditions)
-    return list(jobs.values())
+            planned[key] = Job(path, config, study.conditions)
+    return list(planned.values())
 
 
 def _free(path: Path, taken: set[Path]) -> Path:
@@ -98,47 +96,46 @@ def _free(path: Path, taken: set[Path]) -> Path:
     return next(p for p in itertools.chain([path], numbered) if not p.exists() and p not in taken)
 
 
-def execute(jobs: Sequence[Job], workers: int) -> int:
+def execute(planned: Sequence[Job], workers: int, cluster: str | None = None) -> int:
     """Do the jobs, each in a process of its own; how many failed.
 
     Raises:
+        ValueError: the cluster cannot be used.
         Interrupted: after every run was saved.
     """
-    todo = [job for job in jobs if not job.done()]
-    say(f"{len(jobs)} runs, {len(jobs) - len(todo)} of them finished")
+    todo = [job for job in planned if not job.done()]
+    say(f"{len(planned)} runs, {len(planned) - len(todo)} of them finished")
     failed = 0
     total = sum(job.config.trials for job in todo)
     with SignalTrap() as trap, Progress("trials", total, quiet=not todo) as bar:
-        parallel = Parallel(n_jobs=workers, backend="threading", return_as="generator_unordered")
-        tasks = (delayed(watch)(i, j.path, _command(j), bar, trap) for i, j in enumerate(todo))
-        for _, path, code, message in parallel(tasks):
+        for job, code, message in together(map(_process, todo), workers, bar, trap, cluster):
             if not code:
-                bar.update(0, facts=[f"{path.name} is done"])
+                bar.update(0, facts=[f"{job.path.name} is done"])
             elif not trap.number:
                 failed += 1
-                say(f"failed: {path}, {message}")
+                say(f"failed: {job.path}, {message}")
     if trap.number:
         raise Interrupted(trap.number)
     return failed
 
 
-def _command(job: Job) -> list[str]:
-    text = json.dumps(dataclasses.asdict(job.config))
-    return [sys.executable, "-c", WORK, str(job.path), text, "conditions" * job.conditions]
+def _process(job: Job) -> jobs.Job:
+    arguments = {"config": dataclasses.asdict(job.config), "conditions": job.conditions}
+    return jobs.Job(job.path.name, job.path, WORK, arguments)
 
 
 # ------------------------------------------------------------------------------- a single run
 
 
 @arithmetic()
-def work(directory: str, text: str, conditions: str = "") -> int:
+def work(path: Path, arguments: dict[str, Any], after: training.After | None = None) -> int:
     """Train, evaluate and play in other conditions what is not done yet; the exit code."""
-    path, config = Path(directory), from_dict(json.loads(text))
+    config, conditions = from_dict(arguments["config"]), arguments["conditions"]
     wall, cpu, code = time.perf_counter(), time.process_time(), 0
-    done = Job(path, config, bool(conditions)).done()
+    done = Job(path, config, conditions).done()
     try:
         if not (path / "evaluation.json").exists():
-            _write(path / "evaluation.json", _train_and_evaluate(path, config))
+            _write(path / "evaluation.json", _train_and_evaluate(path, config, after))
         if conditions and not (path / "conditions.json").exists():
             diverged = "diverged" in json.loads((path / "evaluation.json").read_bytes())
             _write(path / "conditions.json", [] if diverged else under_conditions(path))
@@ -156,13 +153,15 @@ def work(directory: str, text: str, conditions: str = "") -> int:
     return code
 
 
-def _train_and_evaluate(path: Path, config: Config) -> dict[str, Any]:
+def _train_and_evaluate(
+    path: Path, config: Config, after: training.After | None = None
+) -> dict[str, Any]:
     options = training.RunOptions.silent(path)
     try:
         if (path / "config.json").exists():
-            training.resume(path, options)
+            training.resume(path, options, after=after)
         else:
-            training.train(config, options)
+            training.train(config, options, after)
     except Divergence as error:  # a result too
         return {"diverged": str(error)}
     config, agent, _, _ = evaluate.load(path)
