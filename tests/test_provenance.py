@@ -115,3 +115,29 @@ def test_studies_name_the_machine_that_played_beside_the_one_that_trained(tmp_pa
         {"instructions": "A"},
         {"instructions": "B"},
     ]
+
+
+def test_comments_and_docstrings_are_no_code():
+    bare = '''"""Say."""
+def f(x):
+    """Do."""
+    # as Kimura does
+    return x + 1
+class A:
+    """Only this."""
+'''
+    assert provenance._bare(bare) == provenance._bare("def f(x): return x + 1\nclass A:\n    pass")
+    assert provenance._bare(bare) != provenance._bare(bare.replace("+ 1", "+ 2"))
+
+
+def test_the_fingerprint_is_of_what_decides_and_of_the_mazes(monkeypatch):
+    seen = []
+    monkeypatch.setattr(provenance, "_bare", lambda source: seen.append(source) or "")
+    provenance.code.cache_clear()
+    provenance.code()
+    package = ROOT / "sofnn_torch"
+    for name in ("network/sofnn.py", "learners/sga.py", "maze/sensors.py", "training.py"):
+        assert (package / name).read_text() in seen
+    for name in ("maze/viewer.py", "plot.py", "studies/report.py"):
+        assert (package / name).read_text() not in seen
+    provenance.code.cache_clear()

@@ -133,6 +133,25 @@ def test_a_run_is_trained_and_evaluated_and_then_kept(tmp_path, monkeypatch):
     assert found == dataclasses.replace(work, conditions=False) and found.done()
 
 
+def test_runs_of_other_code_and_other_evaluations_are_not_reused(tmp_path, monkeypatch, capsys):
+    work = job(tmp_path)
+    assert done(work) == 0
+
+    def planned(**options):
+        return running.plan(tmp_path, ["section5"], "sga-sofnn-est", [0], TINY, **options)[0]
+
+    assert planned().done()
+    evaluation = work.path / "evaluation.json"
+    evaluation.write_text(evaluation.read_text().replace('"episodes": 20', '"episodes": 10'))
+    assert planned().path == work.path and not planned().done()
+    assert done(work) == 0 and planned().done()
+    assert "other code" not in capsys.readouterr().err
+    monkeypatch.setattr(running, "code", lambda: "another")
+    assert planned().path != work.path and not planned().done()
+    assert "1 runs below" in capsys.readouterr().err
+    assert planned(any_code=True).done()
+
+
 def test_a_killed_run_goes_on(tmp_path):
     work = job(tmp_path)
     options = training.RunOptions(tmp_path, work.path.name, quiet=True)
@@ -156,7 +175,7 @@ def test_the_last_trial_is_played_again_to_the_bit(tmp_path):
 
 def test_a_crash_is_reported_and_the_others_finish(tmp_path, monkeypatch, capsys):
     script = "import os\ndef work(path, *_):\n path.mkdir()\n if path.name == 'b': os.abort()\n"
-    (tmp_path / "aborts.py").write_text(f"{script} (path / 'evaluation.json').touch()")
+    (tmp_path / "aborts.py").write_text(f"{script} (path / 'evaluation.json').write_text('{{}}')")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(running, "WORK", "aborts:work")
     jobs = [job(tmp_path, name) for name in "abc"]

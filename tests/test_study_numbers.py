@@ -235,8 +235,18 @@ def test_conditions_are_drawn_for_the_greedy_policy():
 
 def test_hours_are_hours():
     info = {"study": "growth", "commits": ["abc"], "versions": [{"torch": "2"}], "made_with": []}
-    info |= {"runs": 3, "wall_seconds": 7200, "cpu_seconds": 1800}
+    info |= {"arms": {}, "runs": 3, "wall_seconds": 7200, "cpu_seconds": 1800}
     assert "2.00 hours of wall time and 0.50 of processor time" in report.provenance(info)
+
+
+def test_a_page_says_when_its_arms_are_of_different_commits():
+    info = {"study": "growth", "commits": ["a" * 40, "b" * 40], "versions": [], "made_with": []}
+    info |= {"runs": 3, "wall_seconds": 0, "cpu_seconds": 0}
+    info["arms"] = {"one": {"commits": ["a" * 40]}, "two": {"commits": ["a" * 40, "b" * 40]}}
+    expected = "(**the arms are of different commits**: one aaaaaaa; two aaaaaaa, bbbbbbb)"
+    assert expected in report.provenance(info)
+    info["arms"]["one"]["commits"].append("b" * 40)
+    assert "different" not in report.provenance(info)
 
 
 def test_arms_of_equal_settings_and_seeds_are_shown_once():

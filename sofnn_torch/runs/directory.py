@@ -24,7 +24,7 @@ from sofnn_torch.progress import say
 from sofnn_torch.runs import checkpoint, table
 from sofnn_torch.runs.checkpoint import CheckpointError
 from sofnn_torch.runs.places import UNNAMED, alone, first_free
-from sofnn_torch.runs.provenance import commit, versions
+from sofnn_torch.runs.provenance import code, commit, versions
 from sofnn_torch.runs.settings import Config, from_dict
 from sofnn_torch.terminal import quoted
 
@@ -262,11 +262,11 @@ class Run:
         """Keep the versions of the session before; say so where results may differ."""
         try:
             before = json.loads((self.path / "config.json").read_bytes())
-            former = {"versions": before["versions"], "commit": before["commit"]}
+            former = {name: before.get(name) for name in ("versions", "commit", "code")}
         except (OSError, ValueError, KeyError, TypeError):
             return
         self.earlier = before.get("earlier", [])
-        if former == {"versions": versions(), "commit": commit()}:
+        if former == {"versions": versions(), "commit": commit(), "code": code()}:
             return
         self.earlier.append(former)
         then = former["versions"]
@@ -284,6 +284,7 @@ class Run:
                 "config": dataclasses.asdict(self.config),
                 "versions": versions(),
                 "commit": commit(),
+                "code": code(),
                 "earlier": self.earlier,
             },
             indent=2,

@@ -1,7 +1,9 @@
 """Which software and which processor made a result, and how to make the latter not matter."""
 
+import ast
 import contextlib
 import functools
+import hashlib
 import os
 import platform
 import re
@@ -14,10 +16,17 @@ import numpy
 import torch
 
 import sofnn_torch
+from sofnn_torch.maze.layouts import assets
 
 # Torch and MKL choose their instructions by the processor, and sum in another order with each.
 # AVX2 for torch's own kernels, and the branch of MKL that is the same on all makes of processors.
 PORTABLE = {"ATEN_CPU_CAPABILITY": "avx2", "MKL_CBWR": "COMPATIBLE"}
+# What decides, beside settings and versions, what is learned and how it is played.
+DECIDING = (
+    "network learners tasks maze training.py evaluate.py runs/trial.py runs/seeding.py "
+    "runs/factory.py"
+).split()
+SHOWING = ("optimum.py", "rendering.py", "viewer.py")  # of the maze
 
 
 def versions() -> dict[str, str]:
@@ -83,3 +92,35 @@ def commit() -> str | None:
         if answer.returncode == 0 and (here.parent / "pyproject.toml").exists():
             return answer.stdout.strip()
     return None
+
+
+@functools.cache
+def code() -> str:
+    """Fingerprint of the source that decides what is learned; comments and docstrings are none.
+
+    Runs of equal fingerprint, settings and seed are equal but for what `versions` holds.
+    """
+    here = Path(__file__).parents[1]
+    sources = [here / name for name in DECIDING if name.endswith(".py")]
+    sources += [f for name in DECIDING for f in (here / name).glob("*.py") if f.name not in SHOWING]
+    digest = hashlib.sha256()
+    for file in sorted(sources):
+        digest.update(_bare(file.read_text()).encode())
+    for file in sorted([*assets().glob("*.xml"), *assets().glob("mazes/*.txt")]):
+        digest.update(file.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def _bare(source: str) -> str:
+    """Source without comments and docstrings, in a layout of Python's own."""
+    tree = ast.parse(source)
+    for node in ast.walk(tree):
+        body = getattr(node, "body", None)
+        if isinstance(body, list):
+            kept = [n for n in body if not (isinstance(n, ast.Expr) and _is_text(n.value))]
+            node.body = kept or [ast.Pass()]  # type: ignore[attr-defined]
+    return ast.unparse(tree)
+
+
+def _is_text(node: ast.expr) -> bool:
+    return isinstance(node, ast.Constant) and isinstance(node.value, str)

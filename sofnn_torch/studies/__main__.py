@@ -5,7 +5,7 @@
     python -m sofnn_torch.studies --study growth ablation --seeds 0-4 --workers 8
     python -m sofnn_torch.studies --report-only                 # tables and figures from the data
 
-Every run is a normal run directory below --runs and is found again by its settings: finished runs
+Every run is a normal run directory below --runs and is found again by its settings and code: finished
 are kept, a killed one goes on where it was, and studies share the runs that they have in common.
 """
 
@@ -56,6 +56,9 @@ class Options(Settings):
     """Where data, tables and figures go; by default docs/results."""
     runs: Path | None = None
     """Where the runs are; by default runs/studies."""
+    any_code: bool = False
+    """Take finished runs also of code that learns or plays in another way; the pages say of which
+    commits their arms are."""
     quick: bool = False
     """Few short runs, to see everything work: 2 seeds, 30 trials of at most 3000 steps, all of it
     below runs/quick. The numbers mean nothing."""
@@ -121,14 +124,14 @@ def run(options: Options) -> int:
     if asked.report_only:
         return report.write(asked.out)
     numbers, changes = parallel.parse(asked.seeds), variations(asked)
-    jobs = running.plan(asked.runs, asked.study, asked.arms, numbers, changes)
+    jobs = running.plan(asked.runs, asked.study, asked.arms, numbers, changes, asked.any_code)
     if not jobs:
         raise ValueError(f"--arms {asked.arms}: no arm of {', '.join(asked.study)} has that")
     failed = running.execute(jobs, asked.workers, asked.cluster)
     optimum = mean_optimum(plan_of(str(changes.get("maze.layout", STANDARD))))
     for name in asked.study:
         notes = {"command": command(name, asked), "quick": asked.quick, "optimum": optimum}
-        collecting.collect(name, asked.runs, asked.out, changes, notes)
+        collecting.collect(name, asked.runs, asked.out, changes, notes, asked.any_code)
     report.write(asked.out)
     return 1 if failed else 0
 

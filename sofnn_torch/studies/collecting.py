@@ -21,7 +21,12 @@ IN_A_ROW, WITHIN = 10, 1.5  # learned: so many trials in a row under so many tim
 
 
 def collect(
-    name: str, parent: Path, out: Path, changes: Mapping[str, Any], notes: Mapping[str, Any]
+    name: str,
+    parent: Path,
+    out: Path,
+    changes: Mapping[str, Any],
+    notes: Mapping[str, Any],
+    any_code: bool = False,
 ) -> None:
     """Write the data of a study from all its finished runs, whatever their seeds.
 
@@ -32,6 +37,7 @@ def collect(
         changes: settings that are changed in every arm.
         notes: more entries of the summary: command, quick and optimum. Commands of earlier
             sittings stay beside this one.
+        any_code: take also runs of code that learns or plays in another way.
 
     The files are <study>.csv (a line for each run), <study>-curves.csv (steps and rules of each
     trial), <study>-paths.csv (the last trial), <study>-conditions.csv and <study>.json.
@@ -40,7 +46,7 @@ def collect(
     parts = ("", "curves", "paths", "conditions")
     tables: dict[str, list[dict[str, Any]]] = {part: [] for part in parts}
     of_arm: dict[Config, list[tuple[int, Path]]] = {}
-    for config, path in find_runs(parent).items():
+    for config, path in find_runs(parent, any_code).items():
         if (path / "evaluation.json").exists():
             anonymous = dataclasses.replace(config, seed=0)
             of_arm.setdefault(anonymous, []).append((config.seed, path))
@@ -50,18 +56,19 @@ def collect(
         found = sorted(of_arm.get(essence(config), []))
         if not found:
             continue
+        made = [source for _, path in found for source in _sources(path)]
         arms[arm] = {
             "changes": changed(entries),
+            "commits": _distinct(source["commit"] for source in made),
             "seeds": [seed for seed, _ in found],
             "config": {k: v for k, v in dataclasses.asdict(config).items() if k != "seed"},
         }
+        sources += made
         for seed, path in found:
             key = {"arm": arm, "seed": seed}
             row = _row(path, config, notes["optimum"])
             tables[""].append(key | row)
             spans.append((path, row["wall_seconds"], row["cpu_seconds"]))
-            source = json.loads((path / "config.json").read_text())
-            sources += [source, *source.get("earlier", [])]
             if (path / PLAYED).exists():
                 played += json.loads((path / PLAYED).read_text())
             tables["curves"] += [key | curve for curve in _curves(path)]
@@ -95,6 +102,12 @@ def collect(
         "arms": arms,
     }
     file.write_text(json.dumps(summary, indent=1) + "\n")
+
+
+def _sources(path: Path) -> list[dict[str, Any]]:
+    """Versions and commits of a run, of all its sittings."""
+    source = json.loads((path / "config.json").read_text())
+    return [source, *source.get("earlier", [])]
 
 
 def _row(path: Path, config: Config, optimum: int) -> dict[str, Any]:

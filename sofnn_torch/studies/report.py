@@ -91,7 +91,7 @@ def arm_tables(data: Data) -> str:
 
 def provenance(info: dict[str, Any]) -> str:
     """With what a study was made, and how long it took."""
-    commits = ", ".join(f"`{commit}`" for commit in info["commits"])
+    commits = ", ".join(f"`{commit}`" for commit in info["commits"]) + _mixed(info)
     versions = "; ".join(
         ", ".join(f"{name} {version}" for name, version in made.items())
         for made in info["versions"]
@@ -104,6 +104,15 @@ def provenance(info: dict[str, Any]) -> str:
         f"[{info['study']}.json]({info['study']}.json); a line for each run: "
         f"[{info['study']}.csv]({info['study']}.csv)."
     )
+
+
+def _mixed(info: dict[str, Any]) -> str:
+    """Which arms are of which commits, where they differ."""
+    arms = {arm: kept.get("commits") for arm, kept in info["arms"].items()}
+    if all(commits == next(iter(arms.values())) for commits in arms.values()):
+        return ""
+    told = (f"{arm} {', '.join(str(c)[:7] for c in made or ['?'])}" for arm, made in arms.items())
+    return f" (**the arms are of different commits**: {'; '.join(told)})"
 
 
 def _commands(info: dict[str, Any]) -> str:

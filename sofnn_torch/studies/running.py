@@ -17,7 +17,7 @@ from sofnn_torch.progress import Progress, say
 from sofnn_torch.runs import checkpoint, directory, jobs, session
 from sofnn_torch.runs.guard import Divergence
 from sofnn_torch.runs.parallel import together
-from sofnn_torch.runs.provenance import versions
+from sofnn_torch.runs.provenance import code, versions
 from sofnn_torch.runs.session import arithmetic
 from sofnn_torch.runs.settings import Config, from_dict
 from sofnn_torch.runs.signals import Interrupted, SignalTrap
@@ -40,19 +40,32 @@ class Job:
 
     def done(self) -> bool:
         """All its files are there."""
-        names = ["evaluation.json", "conditions.json"][: 1 + self.conditions]
-        return all((self.path / name).exists() for name in names)
+        others = not self.conditions or (self.path / "conditions.json").exists()
+        return _is_evaluated(self.path) and others
 
 
-def find_runs(parent: Path) -> dict[Config, Path]:
-    """The runs in a directory by what determines them; of equal ones the finished."""
+def find_runs(parent: Path, any_code: bool = False) -> dict[Config, Path]:
+    """The runs in a directory by what determines them; of equal ones the finished.
+
+    Args:
+        parent: the directory.
+        any_code: take also runs of code that learns or plays in another way.
+    """
     found: dict[Config, Path] = {}
     for file in sorted(parent.glob("*/config.json")):
         with contextlib.suppress(ValueError):  # written by a version with other settings
             key = essence(directory.load_config(file.parent))
+            if not (any_code or codes(file.parent) == {code()}):
+                continue
             if key not in found or not (found[key] / "evaluation.json").exists():
                 found[key] = file.parent
     return found
+
+
+def codes(run: Path) -> set[str | None]:
+    """Fingerprints of the code that a run was trained with; None for one that was not kept."""
+    source = json.loads((run / "config.json").read_bytes())
+    return {part.get("code") for part in (source, *source.get("earlier", []))}
 
 
 def plan(
@@ -61,6 +74,7 @@ def plan(
     only: str,
     numbers: Sequence[int],
     changes: Mapping[str, Any],
+    any_code: bool = False,
 ) -> list[Job]:
     """The runs that studies need, each once.
 
@@ -70,8 +84,11 @@ def plan(
         only: text that is in the name of every arm to run.
         numbers: seeds.
         changes: settings that are changed in every arm.
+        any_code: take also runs of code that learns or plays in another way.
     """
-    existing = find_runs(parent)
+    existing = find_runs(parent, any_code)
+    if others := len(find_runs(parent, any_code=True)) - len(existing):
+        say(f"{others} runs below {parent} are of other code and left alone; --any-code takes them")
     planned: dict[Config, Job] = {}
     for name in studies:
         study, taken = STUDIES[name], {job.path for job in planned.values()}
@@ -108,8 +125,8 @@ def execute(planned: Sequence[Job], workers: int, cluster: str | None = None) ->
     failed = 0
     total = sum(job.config.trials for job in todo)
     with SignalTrap() as trap, Progress("trials", total, quiet=not todo) as bar:
-        for job, code, message in together(map(_process, todo), workers, bar, trap, cluster):
-            if not code:
+        for job, failure, message in together(map(_process, todo), workers, bar, trap, cluster):
+            if not failure:
                 bar.update(0, facts=[f"{job.path.name} is done"])
             elif not trap.number:
                 failed += 1
@@ -127,14 +144,24 @@ def _process(job: Job) -> jobs.Job:
 # ------------------------------------------------------------------------------- a single run
 
 
+def _is_evaluated(path: Path) -> bool:
+    """It was played, and for as many trials as today."""
+    with contextlib.suppress(OSError, ValueError):
+        return json.loads((path / "evaluation.json").read_bytes()).get("episodes") in (
+            EPISODES,
+            None,
+        )
+    return False
+
+
 @arithmetic()
 def work(path: Path, arguments: dict[str, Any], after: training.After | None = None) -> int:
     """Train, evaluate and play in other conditions what is not done yet; the exit code."""
     config, conditions = from_dict(arguments["config"]), arguments["conditions"]
-    wall, cpu, code = time.perf_counter(), time.process_time(), 0
+    wall, cpu, failure = time.perf_counter(), time.process_time(), 0
     done = Job(path, config, conditions).done()
     try:
-        if not (path / "evaluation.json").exists():
+        if not _is_evaluated(path):
             _write(path / "evaluation.json", _train_and_evaluate(path, config, after))
         if conditions and not (path / "conditions.json").exists():
             diverged = "diverged" in json.loads((path / "evaluation.json").read_bytes())
@@ -143,14 +170,14 @@ def work(path: Path, arguments: dict[str, Any], after: training.After | None = N
             _note_versions(path / PLAYED)
     except (ValueError, OSError, ArithmeticError) as error:
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
-        code = 2
+        failure = 2
     except (Interrupted, KeyboardInterrupt) as stop:
-        code = 128 + getattr(stop, "number", 2)
+        failure = 128 + getattr(stop, "number", 2)
     if path.is_dir():
         spent = [time.perf_counter() - wall, time.process_time() - cpu]
         with open(path / "seconds.csv", "a") as file:  # a line for each sitting
             file.write(f"{spent[0]:.1f},{spent[1]:.1f}\n")
-    return code
+    return failure
 
 
 def _train_and_evaluate(
