@@ -5,8 +5,9 @@
     python -m sofnn_torch.studies --study growth ablation --seeds 0-4 --workers 8
     python -m sofnn_torch.studies --report-only                 # tables and figures from the data
 
-Every run is a normal run directory below --runs, found again by its settings and code: finished runs
-are kept, a killed one goes on where it was, and studies share the runs that they have in common.
+Every run is a normal run directory below --runs, found again by its settings and code: finished
+runs are kept, a killed one goes on where it was, and studies share the runs that they have in
+common.
 """
 
 import dataclasses
