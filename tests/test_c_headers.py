@@ -1,9 +1,11 @@
 """C headers: no warning of a compiler, equal to torch or bit for bit to the model, small."""
 
+import ctypes
 import dataclasses
 import re
 import shutil
 import subprocess
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,6 +14,8 @@ from exported import ALL, learner, states
 from test_export import command, margins  # noqa: F401
 
 from sofnn_torch.export import c, fixed, policy, runtime
+from sofnn_torch.runs.factory import make_agent, make_env
+from sofnn_torch.runs.settings import Config
 
 STRICT = ["-Wall", "-Wextra", "-Werror", "-pedantic", "-std=c99"]
 needs_gcc = pytest.mark.skipif(not shutil.which("gcc"), reason="no gcc")
@@ -136,7 +140,7 @@ def test_whole_numbers_decide_as_the_network_but_near_an_edge(kind):
     found = model.actions(model.inputs(x))
     expected = np.array([ours.act(state) for state in x])
     if data["decision"]["kind"] == "normal" and not data["discrete"]:
-        assert np.abs(found - expected).max() < 0.004
+        assert np.abs(found - expected).max() < 0.02
     else:
         different = (np.abs(found - expected) > 1e-6).reshape(len(x), -1).any(1)
         assert different.mean() < 0.01 and (margins(ours, x)[different] < 0.01).all()
@@ -149,9 +153,10 @@ def test_rules_that_share_their_widths_need_one_row_of_gains(tmp_path):
     )
     data, path = policy.describe(config, agent), tmp_path / "policy.h"
     path.write_bytes(c.to_header(data, path, "int16"))
-    assert "uint16_t policy_rules[40][4]" in path.read_text()
+    assert "uint16_t policy_gains[1][3]" in path.read_text()
     back = c.from_header(path)["fixed"]
     np.testing.assert_array_equal(back.rules, fixed.make(data).rules)
+    np.testing.assert_array_equal(back.gains, fixed.make(data).gains)
 
 
 def test_whole_numbers_refuse_in_one_line_what_they_cannot_hold(tmp_path):
@@ -215,6 +220,52 @@ def test_names_in_a_task_cannot_end_the_comments_of_a_header(tmp_path):
         program(tmp_path, "uint16_t", 2, "uint16_t out[1] = {policy_action(x)};")
 
 
+RULES = Path(__file__).parents[1] / "examples" / "rules"
+
+
+@needs_gcc
+@pytest.mark.parametrize("precision", [pytest.param("float", marks=pytest.mark.slow), "int16"])
+@pytest.mark.parametrize("agent", ["sga", pytest.param("q", marks=pytest.mark.slow)])
+def test_the_header_drives_through_the_maze_as_the_policy_in_python_does(
+    tmp_path, agent, precision
+):
+    """Ten rules by hand, compiled as a library, without the way out of loops."""
+    config = Config(agent=agent, rules=RULES / f"{agent}.csv")
+    data, path = policy.describe(config, make_agent(config)), tmp_path / "policy.h"
+    path.write_bytes(c.to_header(data, path, precision))
+    number = {"float": "float", "int16": "uint16_t"}[precision]
+    source = tmp_path / "policy.c"
+    source.write_text(
+        f'#include "policy.h"\nint decide(const {number} x[3]);\n'
+        f"int decide(const {number} x[3]) {{ return (int)policy_action(x); }}\n"
+    )
+    shared = tmp_path / "policy.so"
+    subprocess.run(
+        ["gcc", "-O2", *STRICT, "-shared", "-fPIC", source, "-o", shared, "-lm"], check=True
+    )
+    decide = ctypes.CDLL(str(shared)).decide
+    ours = runtime.Policy(data)
+    model = fixed.make(data) if precision == "int16" else None
+    env = make_env(config)
+
+    def compiled(x):
+        given = model.inputs(x[None])[0].astype(np.uint16) if model else x.astype(np.float32)
+        return decide(given.ctypes.data_as(ctypes.c_void_p))
+
+    def trial(act):
+        x, info = env.reset(seed=4)
+        done = False
+        while not done:
+            x, _, arrived, cut, info = env.step(act(x))
+            done = arrived or cut
+        return arrived, info["total_steps"]
+
+    (arrived, steps), (expected, count) = trial(compiled), trial(ours.act)
+    env.close()
+    assert arrived and expected
+    assert steps == count if precision == "float" else abs(steps - count) < 0.05 * count
+
+
 # --------------------------------------------------------------------------- small machines
 
 AVR = ("avr-gcc", "-mmcu=atmega328p", "-Os")
@@ -256,6 +307,7 @@ def size(compiler, folder, code):
     ("compiler", "shared"),
     [
         pytest.param(AVR, True, marks=needs("avr-gcc"), id="AVR"),
+        pytest.param(AVR, False, marks=needs("avr-gcc"), id="AVR, own widths"),
         pytest.param(ARM, True, marks=needs("arm-none-eabi-gcc"), id="Cortex-M0"),
         pytest.param(ARM, False, marks=needs("arm-none-eabi-gcc"), id="Cortex-M0, own widths"),
     ],
@@ -268,7 +320,7 @@ def test_a_policy_of_forty_rules_in_whole_numbers_takes_a_kilobyte(tmp_path, com
         agent.net.replace_rules(agent.net.centres, widths, agent.net.consequents)
     path = tmp_path / "policy.h"
     path.write_bytes(c.to_header(policy.describe(config, agent), path, "int16"))
-    assert f"uint16_t policy_rules[40][{4 if shared else 7}]" in path.read_text()
+    assert f"policy_gains[{1 if shared else 40}][3]" in path.read_text()
     bytes_taken = size(compiler, tmp_path, "y = policy_action(s);")
     print(f"{bytes_taken} bytes")
     assert 320 < bytes_taken <= 1024

@@ -15,9 +15,10 @@ from sofnn_torch.runs.rule_files import shortest
 
 HEAD = re.compile(r"/\* sofnn-torch policy (\{.*\}) \*/")
 TABLE = re.compile(r"_rules\[[^\]]+\]\[[^\]]+\](?: \w+)? = \{(.*?)\n\};", re.DOTALL)
-SHARED = re.compile(r"_gains\[\w+\](?: \w+)? = \{(.*?)\};")
+GAINS = re.compile(r"_gains\[[^\]]+\]\[[^\]]+\](?: \w+)? = \{(.*?)\n\};", re.DOTALL)
 NUMBER = re.compile(r"-?\d[\d.]*(?:e[+-]?\d+)?")
 MOST_BYTES = 2**28
+OWN = ("scales", "bits", "shift", "ends")  # of a policy in whole numbers
 
 
 def to_header(data: dict[str, Any], path: Path, precision: str) -> bytes:
@@ -57,22 +58,25 @@ def from_header(path: Path) -> dict[str, Any]:
         if not head or not table or "#endif" not in text[table.end() :]:
             raise ValueError("not a header of this program, or not all of it")
         data = json.loads(head[1])
-        rows = [
-            [float(number) for number in NUMBER.findall(line)]
-            for line in re.findall(r"\{(.*?)\}", table[1])
-        ]
-        if len({len(row) for row in rows}) != 1:
-            raise ValueError("rules of different lengths")
-        if "digits" in data:
-            shared = SHARED.search(text)
-            gains = NUMBER.findall(shared[1]) if shared else []
-            return _fixed_from(data, np.array(rows), np.array(gains, float))
+        rows = _numbers(table[1])
+        if "scales" in data:
+            gains = GAINS.search(text)
+            return _fixed_from(data, np.array(rows), np.array(_numbers(gains[1] if gains else "")))
         data["rules"] = _rules(data, rows)
         return Policy(data).data
     except OSError as error:
         raise ValueError(f"{path}: cannot be read ({error.strerror})") from None
     except (ValueError, KeyError, TypeError, IndexError) as error:
         raise ValueError(f"{path}: {' '.join(str(error).split())}") from None
+
+
+def _numbers(table: str) -> list[list[float]]:
+    """Rows of a table in C."""
+    lines = re.findall(r"\{(.*?)\}", table)
+    rows = [[float(number) for number in NUMBER.findall(line)] for line in lines]
+    if len({len(row) for row in rows}) != 1:
+        raise ValueError("rules of different lengths, or none")
+    return rows
 
 
 def _rules(data: dict[str, Any], rows: list[list[float]]) -> list[dict[str, list[float]]]:
@@ -85,23 +89,19 @@ def _rules(data: dict[str, Any], rows: list[list[float]]) -> list[dict[str, list
 
 
 def _fixed_from(data: dict[str, Any], table: Any, gains: Any) -> dict[str, Any]:
-    """A policy in whole numbers from its head, its table (K, n+M or 2n+M) and common gains."""
-    own = {name: data.pop(name) for name in ("scales", "digits", "shift", "ends")}
+    """A policy in whole numbers from its head, its table (K, n + M) and its gains (K or 1, n)."""
+    own = {name: data.pop(name) for name in OWN}
     n = len(own["scales"])
-    if len(gains):
-        common = np.broadcast_to(gains, (len(table), n))
-        table = np.hstack([table[:, :n], common, table[:, n:]])
-    ends = own.pop("ends")
     wanted = {"normal": data["decision"].get("numbers")}
     wanted["values"] = len(data["decision"].get("codes", []))
-    if table.shape[1] != 2 * n + wanted[data["decision"]["kind"]]:
+    if table.shape[1] != n + wanted[data["decision"]["kind"]] or gains.shape[1] != n:
         raise ValueError("its rules are not those of its inputs and outputs")
-    if table.min() < 0 or table.max() >= fixed.WHOLE:
+    if len(gains) not in (1, len(table)):
+        raise ValueError(f"{len(table)} rules have {len(gains)} rows of gains")
+    if min(table.min(), gains.min()) < 0 or max(table.max(), gains.max()) >= fixed.WHOLE:
         raise ValueError("numbers of its rules need more than 16 bits")
-    return {
-        **data,
-        "fixed": fixed.FixedPolicy(data, **own, rules=table.astype(np.uint32), ends=ends),
-    }
+    tables = {"rules": table.astype(np.uint32), "gains": gains.astype(np.uint32)}
+    return {**data, "fixed": fixed.FixedPolicy(data, **own, **tables)}
 
 
 def _comment(data: dict[str, Any]) -> str:
@@ -194,7 +194,7 @@ def _c(number: float) -> str:
 
 
 def _fixed(name: str, policy: fixed.FixedPolicy) -> str:
-    data, n, shared = policy.head, policy.n, policy.shared
+    data, n = policy.head, policy.n
     about, clamp = [], []
     for i, (axis, (origin, step)) in enumerate(zip(data["axes"], policy.scales, strict=False)):
         what, unit = _plain(axis["name"]), _plain(axis["unit"])
@@ -208,10 +208,7 @@ def _fixed(name: str, policy: fixed.FixedPolicy) -> str:
             clamp = [f"        if (action[j] < {low}u) action[j] = {low}u;"]
             clamp += [f"        if (action[j] > {high}u) action[j] = {high}u;"]
         about.append(f"where {low} is -1 and {high} is 1")
-    table = policy.rules
-    if shared:
-        table = np.hstack([table[:, :n], table[:, 2 * n :]])
-    own = {name: getattr(policy, name) for name in ("scales", "digits", "shift", "ends")}
+    own = {name: getattr(policy, name) for name in OWN}
     kind = "acting" if policy.acting else data["decision"]["kind"]
     action = "discrete" if data["discrete"] else "continuous"
     a, b, c = fixed.CUBIC
@@ -222,19 +219,20 @@ def _fixed(name: str, policy: fixed.FixedPolicy) -> str:
         "ABOUT": "\n".join(f" *     {line}" for line in about),
         "STATE": str(len(data["axes"])),
         "INPUTS": str(n),
-        "RULES": str(len(table)),
-        "COLUMNS": str(table.shape[1]),
+        "RULES": str(len(policy.rules)),
+        "COLUMNS": str(policy.rules.shape[1]),
         "SUMS": "1" if policy.acting else str(policy.conclusions),
         "CONCLUSIONS": str(policy.conclusions),
-        "TABLE": _rows(table),
-        "GAINS": ", ".join(map(str, policy.rules[0, n : 2 * n].tolist())),
-        "GAIN": "NAME_READ(NAME_gains + i)" if shared else f"NAME_READ(p + {n} + i)",
-        "FIRST": f"{n if shared else 2 * n}{' + first' * policy.acting}",
+        "TABLE": _rows(policy.rules),
+        "GAINS": _rows(policy.gains),
+        "GAIN_ROWS": str(len(policy.gains)),
+        "GAIN_BITS": str(policy.bits),
+        "GAIN_READ": "word" if policy.bits == 16 else "byte",
+        "SAME_GAINS": f"            g -= {n};" * (len(policy.gains) == 1),
+        "FIRST": " + first" * policy.acting,
         "ARGUMENT": ", uint16_t first" * policy.acting,
-        "WHOLE": str(2 * policy.digits),
-        "FRACTION": str(2 * policy.digits - 16),
         "SHIFT": str(policy.shift),
-        "FULL": str(15 + policy.shift),
+        "MOST": f"{policy.most}u",
         "A": f"{a}u",
         "B": f"{b}u",
         "C": f"{c}u",
@@ -245,9 +243,7 @@ def _fixed(name: str, policy: fixed.FixedPolicy) -> str:
         "CODES": ", ".join(f"{code}u" for code in policy.codes) if policy.acting else "",
         "POINTS": ", ".join(map(_c, data["decision"].get("representatives", []))),
     }
-    gains = templates.FIXED_GAINS if shared else ""
-    body = templates.FIXED.replace("@GAINS_TABLE@", gains)
-    return _fill(body + templates.FIXED_ACTS[kind, action] + templates.END, values)
+    return _fill(templates.FIXED + templates.FIXED_ACTS[kind, action] + templates.END, values)
 
 
 def _fill(text: str, values: dict[str, str]) -> str:

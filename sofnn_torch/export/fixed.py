@@ -2,13 +2,13 @@
 
 Everything is unsigned, 16 bits in the tables and 32 in between. For rule k at inputs x:
 
-    r_i = |x_i - u_i| g_i / 2^16          distance over width, with F binary digits
-    z   = sum_i r_i^2                     so that the firing strength is 2^-z, 2 F digits
-    w   = 2^-(z - z0) * 65535             by a cubic for the fraction and a shift for the rest
-    y_j = sum_k (w c_j / 2^S) / sum_k w   S such that no sum overflows
+    r_i = 2 |x_i - u_i| g_i / 2^S         distance over width with 12 binary digits, at most 8
+    z   = sum_i r_i^2 / 2^16              so that the firing strength is 2^-z, 8 digits
+    w   = 2^-(z - min z) * 65535          by a cubic for the fraction and a shift for the rest
+    y_j = sum_k (w c_j / 2^16) / sum_k w
 
-z0 is the whole part of the least z so far; where a nearer rule follows, the sums are shifted. So
-the nearest rules answer far from all. An input that wraps takes all 16 bits, and wraps by itself.
+The least z is found first, so the nearest rules answer far from all. Gains g have 8 bits where that
+rounds none by more than 2 %, else 16. An input that wraps takes all 16 bits, and wraps by itself.
 
 What does not change the plain mean or greedy action is left out: sigma, the value, and of
 Q-learning all that is the same for every action.
@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 CUBIC = (45340, 15200, 2632)  # of 2^-f over [0, 1), in units of 2^-16: off by at most 7e-5
 HALF, WHOLE = 2**15, 2**16
-LEAST_DIGITS = 8  # of distances over widths
+LEAST_WIDTH = 32  # steps of its input that a rule must be wide
 DIGITS_PER_WIDTH = math.sqrt(0.5 * math.log2(math.e))  # exp(-(d / v)^2 / 2) = 2^-(this d / v)^2
 
 Integers = NDArray[np.uint32]
@@ -39,19 +39,20 @@ class FixedPolicy:
     Attributes:
         head: the neutral policy without its rules.
         scales: origin and step of each input, as in ``x = (value - origin) / step``.
-        digits: F.
+        bits: of the gains.
         shift: S.
-        rules: n centres, n gains (one row for all rules if they share them), M conclusions.
-            Shape: (K, 2n+M).
+        rules: n centres and M conclusions. Shape: (K, n + M).
+        gains: of each rule, or one row if all have the same. Shape: (K or 1, n).
         ends: conclusions that stand for the edges between discrete actions, or for -1 and 1.
     """
 
     head: dict[str, Any]
     scales: list[list[float]]
-    digits: int
+    bits: int
     shift: int
-    rules: Integers
     ends: list[int]
+    rules: Integers
+    gains: Integers
 
     @property
     def n(self) -> int:
@@ -61,13 +62,12 @@ class FixedPolicy:
     @property
     def conclusions(self) -> int:
         """Conclusions M of a rule."""
-        return self.rules.shape[1] - 2 * self.n
+        return self.rules.shape[1] - self.n
 
     @property
-    def shared(self) -> bool:
-        """Whether all rules have the same gains, which then stand in one row."""
-        gains = self.rules[:, self.n : 2 * self.n]
-        return bool((gains == gains[0]).all())
+    def most(self) -> int:
+        """The greatest distance over width, so that no sum of squares overflows."""
+        return min(HALF - 1, math.isqrt(2**32 // self.n - 1))
 
     @property
     def acting(self) -> bool:
@@ -90,7 +90,7 @@ class FixedPolicy:
         if self.acting:
             columns = [np.full((len(x), 1), code, np.uint32) for code in self.codes]
             means = [
-                _ratio(*self._sums(np.hstack([x, column]), [j]))[:, 0]
+                _share(*self._sums(np.hstack([x, column]), [j]))[:, 0]
                 for j, column in enumerate(columns)
             ]
             return np.argmax(means, 0).astype(np.uint32)
@@ -98,10 +98,9 @@ class FixedPolicy:
         if self.head["decision"]["kind"] == "values":
             return sums.argmax(1).astype(np.uint32)
         if self.head["discrete"]:
-            edges = np.array(self.ends, np.uint32)
-            return (sums > edges * total[:, None]).sum(1).astype(np.uint32)
+            return (_share(sums, total) > np.array(self.ends)).sum(1).astype(np.uint32)
         low, high = self.ends
-        return _ratio(sums, total).clip(low, high)
+        return _share(sums, total).clip(low, high)
 
     def actions(self, x: Integers) -> Any:
         """Answers at inputs (B, n) as `Policy.act` of the runtime gives them: (B,) or (B, m)."""
@@ -114,30 +113,19 @@ class FixedPolicy:
         return 2 * (found.astype(float) - low) / (high - low) - 1
 
     def _sums(self, x: Integers, columns: list[int]) -> tuple[Integers, Integers]:
-        """Weighted sums (B, C) of some conclusions, and of the weights (B,) scaled to 16 bits."""
-        n, two = self.n, 2 * self.digits
-        total = np.zeros(len(x), np.uint32)
-        sums = np.zeros((len(x), len(columns)), np.uint32)
-        nearest = np.full(len(x), WHOLE - 1, np.uint32)
-        for rule in self.rules:
-            d = (x - rule[:n]) % WHOLE
-            d = np.where(d >= HALF, WHOLE - d, d)
-            d = (d * rule[n : 2 * n]) >> 16
-            z = (d * d).sum(1, dtype=np.uint32)
-            whole = z >> two
-            drop = np.where(whole < nearest, nearest - whole, 0).clip(max=31)
-            total, sums = total >> drop, sums >> drop[:, None]
-            nearest = np.minimum(nearest, whole)
-            f = (z >> (two - 16)) % WHOLE
-            a, b, c = CUBIC
-            w = WHOLE - 1 - (f * (a - (f * (b - (f * c >> 16)) >> 16)) >> 16)
-            w = w >> (whole - nearest).clip(max=31)
-            total = total + w
-            sums = sums + ((w[:, None] * rule[2 * n :][columns]) >> self.shift)
-        for _ in range(16):
-            small = (total < 1 << (15 + self.shift)).astype(np.uint32)
-            total, sums = total << small, sums << small[:, None]
-        return sums, (total >> self.shift).astype(np.uint32)
+        """Weighted sums (B, C) of some conclusions, and of the weights (B,)."""
+        d = (x[:, None] - self.rules[:, : self.n]) % WHOLE
+        d = np.where(d >= HALF, WHOLE - 1 - d, d)
+        r = ((2 * d * self.gains) >> self.shift).clip(max=self.most)
+        z = (r**2 >> 16).sum(2, dtype=np.uint32)
+        z = z - z.min(1, keepdims=True)
+        f = (z << 8) % WHOLE
+        a, b, c = CUBIC
+        w = WHOLE - 1 - (f * (a - (f * (b - (f * c >> 16)) >> 16)) >> 16)
+        w = w >> (z >> 8).clip(max=16)
+        conclusions = self.rules[:, self.n :][:, columns]
+        sums = ((w[:, :, None] * conclusions) >> 16).sum(1, dtype=np.uint32)
+        return sums, w.sum(1, dtype=np.uint32)
 
 
 def make(data: dict[str, Any]) -> FixedPolicy:
@@ -153,22 +141,22 @@ def make(data: dict[str, Any]) -> FixedPolicy:
     scales = [_scale(axis, u) for axis, u in zip(axes, part["centre"].T, strict=True)]
     centres = _placed(part["centre"], scales, [axis["period"] for axis in axes])
     steps = np.array([step for _, step in scales])
-    farthest = DIGITS_PER_WIDTH * HALF * steps / part["width"].min(0)  # of any state, in widths
-    most = min(HALF - 1, math.isqrt(2**32 // len(axes)) - 1)
-    digits = math.floor(math.log2(most / farthest.max()))
-    if digits < LEAST_DIGITS:
-        name, share = axes[int(farthest.argmax())]["name"], 1 / farthest.max()
+    narrow = (part["width"] / steps).min(0)
+    if narrow.min() < LEAST_WIDTH:
+        name = axes[int(narrow.argmin())]["name"]
         raise ValueError(
-            f"int16 cannot hold rules on {name} as narrow as {share:.2g} of its range: "
-            "use --precision float"
+            f"int16 cannot hold rules on {name} as narrow as {narrow.min() / WHOLE:.2g} of its "
+            "range: use --precision float"
         )
-    digits = min(digits, 15)
-    gains = np.round(DIGITS_PER_WIDTH * steps / part["width"] * 2.0 ** (digits + 16))
+    gains = DIGITS_PER_WIDTH * steps / part["width"] * 2.0**11
+    bits = 16 if (gains == gains[0]).all() or gains.max() > 10 * gains.min() else 8
+    shift = min(bits, math.floor(math.log2((2**bits - 1) / gains.max())))
+    gains = np.round(gains * 2.0**shift).astype(np.uint32)
+    gains = gains[:1] if (gains == gains[0]).all() else gains
     conclusions, ends = _conclusions(data, part["consequents"], len(data["axes"]))
-    rules = np.hstack([centres, gains, conclusions]).astype(np.uint32)
+    rules = np.hstack([centres, conclusions]).astype(np.uint32)
     head = {name: value for name, value in data.items() if name != "rules"}
-    shift = max(0, (len(rules) - 1).bit_length())
-    return FixedPolicy(head, scales, digits, shift, rules, ends)
+    return FixedPolicy(head, scales, bits, shift, ends, rules, gains)
 
 
 def _scale(axis: dict[str, Any], centres: NDArray[Any]) -> list[float]:
@@ -214,5 +202,6 @@ def _conclusions(data: dict[str, Any], table: NDArray[Any], n: int) -> tuple[Any
     return np.round(values / (values.max() or 1.0) * (WHOLE - 1)), []
 
 
-def _ratio(sums: Integers, total: Integers) -> Integers:
-    return np.minimum(sums // total[:, None], WHOLE - 1).astype(np.uint32)
+def _share(sums: Integers, total: Integers) -> Integers:
+    """Sums (B, C) over the greater sums of the weights (B,), in units of 2^-16."""
+    return ((sums.astype(np.uint64) << 16) // total[:, None]).astype(np.uint32)

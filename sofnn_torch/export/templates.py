@@ -180,74 +180,78 @@ FIXED = """\
 
 #include <stdint.h>
 
-#ifdef __AVR__ /* the table stays in the flash memory */
+#ifdef __AVR__ /* the tables stay in the flash memory */
 #include <avr/pgmspace.h>
 #define NAME_TABLE PROGMEM
 #define NAME_READ(p) pgm_read_word(p)
+#define NAME_GAIN(p) pgm_read_@GAIN_READ@(p)
+#define NAME_CALLED __attribute__((noinline)) /* smaller */
 #else
+#define NAME_CALLED
 #define NAME_TABLE
 #define NAME_READ(p) (*(p))
+#define NAME_GAIN(p) (*(p))
 #endif
 
-/* Of each rule: centres, gains unless all have the same, conclusions. */
+/* Of each rule: centres and conclusions. */
 static const uint16_t NAME_rules[@RULES@][@COLUMNS@] NAME_TABLE = {
 @TABLE@
 };
-@GAINS_TABLE@
+/* Of each rule, or of all the same: gains. */
+static const uint@GAIN_BITS@_t NAME_gains[@GAIN_ROWS@][@INPUTS@] NAME_TABLE = {
+@GAINS@
+};
 
-static inline uint16_t NAME_times(uint16_t a, uint16_t b) {
-    return (uint16_t)((uint32_t)a * b >> 16);
+static NAME_CALLED uint32_t NAME_product(uint16_t a, uint16_t b) { return (uint32_t)a * b; }
+
+static NAME_CALLED uint16_t NAME_times(uint16_t a, uint16_t b) {
+    return (uint16_t)(NAME_product(a, b) >> 16);
 }
 
-/* Sums of the conclusions, weighted; the sum of the weights, at least 2^15. */
-static inline uint16_t NAME_sums(const uint16_t x[@INPUTS@], uint32_t sums[@SUMS@]@ARGUMENT@) {
-    const uint16_t *p = NAME_rules[0];
-    uint16_t nearest = 65535u, k;
+/* Sums of the conclusions, weighted; the sum of the weights, at least 65535. */
+static inline uint32_t NAME_sums(const uint16_t x[@INPUTS@], uint32_t sums[@SUMS@]@ARGUMENT@) {
     uint32_t total = 0;
-    uint8_t i;
+    uint16_t nearest = 65535u, k;
+    uint8_t pass, i;
     @INDEX@ j;
     for (j = 0; j < @SUMS@; j++) sums[j] = 0;
-    for (k = 0; k < @RULES@; k++, p += @COLUMNS@) {
-        uint32_t z = 0;
-        uint16_t whole, f, w;
-        for (i = 0; i < @INPUTS@; i++) {
-            uint16_t d = (uint16_t)(x[i] - NAME_READ(p + i));
-            if (d & 0x8000u) d = (uint16_t)(0u - d);
-            d = NAME_times(d, @GAIN@);
-            z += (uint32_t)d * d;
+    for (pass = 0; pass < 2; pass++) { /* weights are relative to the nearest rule */
+        const uint16_t *p = NAME_rules[0];
+        const uint@GAIN_BITS@_t *g = NAME_gains[0];
+        for (k = 0; k < @RULES@; k++, p += @CONCLUSIONS@) {
+            uint16_t z = 0, f, w;
+            for (i = 0; i < @INPUTS@; i++) {
+                uint16_t d = (uint16_t)(x[i] - NAME_READ(p++));
+                uint32_t r;
+                if (d & 0x8000u) d = (uint16_t)~d;
+                r = NAME_product((uint16_t)(d << 1), NAME_GAIN(g++)) >> @SHIFT@;
+                if (r > @MOST@) r = @MOST@;
+                z = (uint16_t)(z + NAME_times((uint16_t)r, (uint16_t)r));
+            }
+@SAME_GAINS@
+            if (!pass) {
+                if (z < nearest) nearest = z;
+                continue;
+            }
+            z = (uint16_t)(z - nearest);
+            if (z >> 12) continue;
+            f = (uint16_t)(z << 8);
+            w = NAME_times(f, (uint16_t)(@B@ - NAME_times(f, @C@)));
+            w = (uint16_t)((uint16_t)(65535u - NAME_times(f, (uint16_t)(@A@ - w))) >> (z >> 8));
+            total += w;
+            for (j = 0; j < @SUMS@; j++) sums[j] += NAME_times(w, NAME_READ(p + j@FIRST@));
         }
-        whole = (uint16_t)(z >> @WHOLE@);
-        if (whole < nearest) { /* weights are relative to the nearest rule so far */
-            uint16_t drop = (uint16_t)(nearest - whole);
-            if (drop > 31u) drop = 31u;
-            total >>= drop;
-            for (j = 0; j < @SUMS@; j++) sums[j] >>= drop;
-            nearest = whole;
-        }
-        whole = (uint16_t)(whole - nearest);
-        if (whole > 15u) continue;
-        f = (uint16_t)(z >> @FRACTION@);
-        w = NAME_times(f, (uint16_t)(@B@ - NAME_times(f, @C@)));
-        w = (uint16_t)(65535u - NAME_times(f, (uint16_t)(@A@ - w))) >> whole;
-        total += w;
-        for (j = 0; j < @SUMS@; j++) sums[j] += (uint32_t)w * NAME_READ(p + @FIRST@ + j) >> @SHIFT@;
     }
-    while (!(total >> @FULL@)) {
-        total <<= 1;
-        for (j = 0; j < @SUMS@; j++) sums[j] <<= 1;
-    }
-    return (uint16_t)(total >> @SHIFT@);
+    return total;
 }
 
 """
-
-FIXED_GAINS = "static const uint16_t NAME_gains[@INPUTS@] NAME_TABLE = {@GAINS@};\n"
 
 FIXED_GREATEST = """\
 static inline uint16_t NAME_choice(const uint16_t x[@STATE@]) {
     uint32_t sums[@SUMS@];
     uint16_t best = 0, j;
-    NAME_sums(x, sums);
+    (void)NAME_sums(x, sums);
     for (j = 1; j < @SUMS@; j++)
         if (sums[j] > sums[best]) best = j;
     return best;
@@ -255,20 +259,40 @@ static inline uint16_t NAME_choice(const uint16_t x[@STATE@]) {
 
 """
 
-FIXED_ACTING = """\
+SHARE = """\
+/* A sum over the greater sum of the weights, in units of 2^-16. */
+static inline uint16_t NAME_share(uint32_t sum, uint32_t total) {
+    uint16_t share = 0;
+    uint8_t i;
+    for (i = 0; i < 16; i++) {
+        sum <<= 1;
+        share = (uint16_t)(share << 1);
+        if (sum >= total) {
+            sum -= total;
+            share++;
+        }
+    }
+    return share;
+}
+
+"""
+
+FIXED_ACTING = (
+    SHARE
+    + """\
 static inline uint16_t NAME_choice(const uint16_t x[@STATE@]) {
     static const uint16_t codes[@CONCLUSIONS@] = {@CODES@};
-    uint16_t inputs[@INPUTS@], best = 0, j;
-    uint32_t greatest = 0, sum[1];
+    uint16_t inputs[@INPUTS@], best = 0, greatest = 0, j;
+    uint32_t sum[1];
     for (j = 0; j < @STATE@; j++) inputs[j] = x[j];
     for (j = 0; j < @CONCLUSIONS@; j++) {
-        uint16_t total;
+        uint32_t total;
+        uint16_t value;
         inputs[@STATE@] = codes[j];
         total = NAME_sums(inputs, sum, j);
-        sum[0] /= total;
-        if (sum[0] > 65535u) sum[0] = 65535u;
-        if (j == 0 || sum[0] > greatest) {
-            greatest = sum[0];
+        value = NAME_share(sum[0], total);
+        if (j == 0 || value > greatest) {
+            greatest = value;
             best = j;
         }
     }
@@ -276,6 +300,7 @@ static inline uint16_t NAME_choice(const uint16_t x[@STATE@]) {
 }
 
 """
+)
 
 CHOSEN = (
     "static inline uint16_t NAME_action(const uint16_t x[@STATE@]) { return NAME_choice(x); }\n"
@@ -290,26 +315,28 @@ FIXED_ACTS = {
     ("values", "continuous"): FIXED_GREATEST + POINTED + CHOSEN,
     ("acting", "discrete"): FIXED_ACTING + CHOSEN,
     ("acting", "continuous"): FIXED_ACTING + POINTED + CHOSEN,
-    ("normal", "discrete"): """\
+    ("normal", "discrete"): SHARE
+    + """\
 static inline uint16_t NAME_action(const uint16_t x[@STATE@]) {
     static const uint16_t edges[@ENDS_COUNT@] = {@ENDS@};
     uint32_t sums[1];
-    const uint16_t total = NAME_sums(x, sums);
+    const uint32_t total = NAME_sums(x, sums);
+    const uint16_t mean = NAME_share(sums[0], total);
     uint16_t action = 0;
     @INDEX@ j;
     for (j = 0; j < @ENDS_COUNT@; j++)
-        if (sums[0] > (uint32_t)edges[j] * total) action++;
+        if (mean > edges[j]) action++;
     return action;
 }
 """,
-    ("normal", "continuous"): """\
+    ("normal", "continuous"): SHARE
+    + """\
 static inline void NAME_action(const uint16_t x[@STATE@], uint16_t action[@SUMS@]) {
     uint32_t sums[@SUMS@];
-    const uint16_t total = NAME_sums(x, sums);
+    const uint32_t total = NAME_sums(x, sums);
     @INDEX@ j;
     for (j = 0; j < @SUMS@; j++) {
-        sums[j] /= total;
-        action[j] = sums[j] > 65535u ? 65535u : (uint16_t)sums[j];
+        action[j] = NAME_share(sums[j], total);
 @CLAMP@
     }
 }
