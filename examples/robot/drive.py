@@ -9,7 +9,6 @@ lines of simulated.py. Where it is the driver works out from encoders, infrared 
 floor, as the learner did. No hardware was at hand: this has been tried on the simulated robot only.
 """
 
-import math
 import socket
 import sys
 from collections.abc import Callable
@@ -18,9 +17,8 @@ from typing import Any
 
 from sofnn_torch.export.runtime import Policy, read
 from sofnn_torch.maze.odometry import DeadReckoning
+from sofnn_torch.maze.sensors import felt_walls
 
-TOUCHING = 0.004  # m: an infrared range that means that the robot touches a wall
-BEARINGS = [math.radians(a) for a in (90, 45, 10, -10, -45, -90, -180, 180)]  # of the infrared
 PATIENCE = 2.0  # s for an answer
 
 Ask = Callable[[str], str]
@@ -36,7 +34,8 @@ class Driver:
 
     def __init__(self, policy: Policy, ask: Ask):
         self.policy, self.ask = policy, ask
-        self.place = DeadReckoning(wheel_base=policy.robot["wheel_base"])
+        base = policy.robot["wheel_base"]
+        self.place = DeadReckoning(wheel_base=base, right_angles=True)  # walls along x or y
         self.counted = (0.0, 0.0)
 
     def trial(self, limit: int = 4000) -> int | None:
@@ -68,9 +67,9 @@ class Driver:
         if not words:
             return False, False
         left, right, *ranges = map(float, words[:10])
-        # At 0 mm/s a wall beside the robot would hold it; what is near counts as felt.
-        walls = [b for b, r in zip(BEARINGS, ranges, strict=True) if r < TOUCHING]
-        self.place.update(left - self.counted[0], right - self.counted[1], walls)
+        rolled = left - self.counted[0], right - self.counted[1]
+        walls = felt_walls(ranges, sum(rolled)) if sum(rolled) else []
+        self.place.update(*rolled, walls)
         self.counted = left, right
         mark = words[10:]
         if len(mark) == 3:

@@ -7,12 +7,13 @@ wheels [m/s]. After each it drives for 0.5 s and then answers with one line:
 
     left right  ir ir ir ir ir ir ir ir  [goal | x y heading]
 
-what the encoders of the wheels have counted since the start [m], eight infrared ranges [m], and
-which mark on the floor it stands on: that of the goal, or one that says where it is. An empty line
-stands for an answer that did not come in time.
+what the encoders of the wheels have counted since the start [m], eight infrared ranges [m, off by
+at most 10 %], and which mark it is on: the goal, or one on which it has just come and that says
+where it is. An empty line stands for an answer that did not come in time.
 """
 
 import argparse
+import math
 import socket
 from dataclasses import dataclass
 
@@ -21,6 +22,7 @@ import numpy as np
 from sofnn_torch.maze.layouts import STANDARD
 from sofnn_torch.maze.odometry import STEP_SECONDS, MotorNoise
 from sofnn_torch.maze.robot import Physics
+from sofnn_torch.maze.sensors import INFRARED, readings
 
 Speeds = tuple[float, float]
 
@@ -58,10 +60,9 @@ class SimulatedRobot:
         self.physics, self.noise = Physics(layout), MotorNoise()
         self.timestep = self.physics.model.opt.timestep
         plan = self.physics.plan
-        marks = [(centre, plan.subgoal_radius, False) for centre in plan.subgoals]
-        marks += [(start[:2], plan.start_radius, False) for start in plan.starts]
-        self.marks = marks + [(centre, plan.goal_radius, True) for centre in plan.goals]
-        self.steps = 0
+        self.goals = [(centre, plan.goal_radius) for centre in plan.goals]
+        self.marks = [(centre, plan.subgoal_radius) for centre in plan.subgoals]
+        self.steps, self.marked = 0, False
         self.speeds: Speeds = (0.0, 0.0)
 
     def answer(self, line: str) -> str:
@@ -69,7 +70,8 @@ class SimulatedRobot:
         reset = line.strip() == "start"
         if reset:
             self.physics.place(self.physics.plan.start)
-            self.steps, self.speeds, told = 0, (0.0, 0.0), (0.0, 0.0)
+            self.steps, self.marked = 0, False
+            self.speeds = told = (0.0, 0.0)
         elif self._arrives():
             left, right = map(float, line.split())
             told = (left, right)
@@ -103,12 +105,17 @@ class SimulatedRobot:
         left, right = self.physics.wheel_travel()
         middle, turn = (left + right) / 2, (right - left) / 2 * self.faults.base
         counted = ((middle + side * turn) / self.faults.radius for side in (-1, 1))
-        numbers = [*counted, *self.physics.infrared_ranges()]
-        pose, word = self.physics.pose(), ""
-        for (x, y), radius, goal in self.marks:
-            if (pose[0] - x) ** 2 + (pose[1] - y) ** 2 <= radius**2:
-                word = "goal" if goal else " ".join(f"{part:.4f}" for part in pose)
+        draws = self.rng.random(len(INFRARED)).tolist()
+        numbers = [*counted, *readings(self.physics.infrared_ranges(), 0.1, draws)]
+        before, self.marked = self.marked, self._on(self.marks)
+        word = "goal" if self._on(self.goals) else ""
+        if self.marked and not before:
+            word = " ".join(f"{part:.4f}" for part in self.physics.pose())
         return " ".join(f"{number:.5f}" for number in numbers) + f" {word}"
+
+    def _on(self, marks: list[tuple[tuple[float, ...], float]]) -> bool:
+        here = self.physics.position()
+        return any(math.dist(here, centre) <= radius for centre, radius in marks)
 
 
 def serve(connection: socket.socket, robot: SimulatedRobot) -> None:
