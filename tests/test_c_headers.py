@@ -143,7 +143,7 @@ def test_whole_numbers_decide_as_the_network_but_near_an_edge(kind):
         assert np.abs(found - expected).max() < 0.02
     else:
         different = (np.abs(found - expected) > 1e-6).reshape(len(x), -1).any(1)
-        assert different.mean() < 0.01 and (margins(ours, x)[different] < 0.01).all()
+        assert different.mean() < 0.01 and (margins(ours, x)[different] < 0.03).all()
 
 
 def test_rules_that_share_their_widths_need_one_row_of_gains(tmp_path):
