@@ -2,8 +2,6 @@
 
 import runpy
 import socket
-import subprocess
-import sys
 import threading
 from pathlib import Path
 
@@ -11,8 +9,6 @@ import pytest
 from exported import learner
 
 from sofnn_torch.export import policy, runtime
-from sofnn_torch.runs.factory import make_agent
-from sofnn_torch.runs.settings import Config
 
 ROBOT = Path(__file__).parents[1] / "examples" / "robot"
 
@@ -88,43 +84,6 @@ def test_a_weak_motor_and_a_wide_base_turn_the_robot(parts):
     assert turned == pytest.approx(0.8, abs=0.04)
     assert heading("-0.004 0.004", base=1.1) == pytest.approx(turned / 1.1, abs=0.02)
     assert heading("0.01 0.01", left=0.9) == pytest.approx(0.1, abs=0.02)
-
-
-def by_hand(agent):
-    """The policy of ten rules by hand."""
-    config = Config(agent=agent, rules=ROBOT.parent / "rules" / f"{agent}.csv")
-    return policy.describe(config, make_agent(config))
-
-
-@pytest.mark.parametrize("agent", ["sga", pytest.param("q", marks=pytest.mark.slow)])
-def test_ten_rules_by_hand_arrive_by_encoders_infrared_and_marks(parts, agent):
-    robot = parts["SimulatedRobot"](parts["Faults"](late=0.1), seed=3)
-    driver = parts["Driver"](runtime.Policy(by_hand(agent), seed=0), robot.answer)
-    assert 480 < driver.trial() < 650
-
-
-@pytest.mark.slow
-def test_a_driver_and_a_robot_of_their_own_processes_arrive(tmp_path):
-    path = tmp_path / "policy.json"
-    path.write_bytes(policy.to_json(by_hand("sga")))
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        port = free.getsockname()[1]
-    call = [sys.executable, ROBOT / "simulated.py", "--port", str(port), "--lost", "0.05"]
-    with subprocess.Popen(call, stdout=subprocess.PIPE, text=True) as robot:
-        assert "waiting" in robot.stdout.readline()
-        drive = [sys.executable, ROBOT / "drive.py", path, f"127.0.0.1:{port}"]
-        done = subprocess.run(drive, capture_output=True, text=True)
-        robot.kill()
-    assert done.returncode == 0 and done.stdout.startswith("arrived after "), done.stderr
-
-
-@pytest.mark.slow
-def test_the_table_counts_all_trials(monkeypatch):
-    monkeypatch.syspath_prepend(str(ROBOT))
-    table = runpy.run_path(str(ROBOT / "survives.py"))
-    steps = table["drive"](by_hand("sga"), table["Faults"](), 3, 700)
-    assert len(steps) == 3 and all(480 < count < 650 for count in steps)
-    assert table["drive"](by_hand("sga"), table["Faults"](), 1, 100) == [None]
 
 
 def test_a_wrong_call_is_one_line(parts, tmp_path, east, monkeypatch):
