@@ -1,5 +1,6 @@
 """The closed loop of examples/robot: an exported policy drives a robot by lines of text."""
 
+import math
 import runpy
 import socket
 import threading
@@ -9,6 +10,8 @@ import pytest
 from exported import learner
 
 from sofnn_torch.export import policy, runtime
+from sofnn_torch.runs.factory import make_agent
+from sofnn_torch.runs.settings import Config
 
 ROBOT = Path(__file__).parents[1] / "examples" / "robot"
 
@@ -43,6 +46,21 @@ def test_a_policy_drives_over_a_socket_and_knows_where_it_is(parts, east):
     assert 0.6 < x < 0.9 and abs(y - 0.15) < 0.03
     assert driver.place.pose[:2] == pytest.approx((x, y), abs=0.02)
     assert robot.steps == 120
+
+
+def test_ten_rules_by_hand_arrive_by_encoders_infrared_and_marks(parts):
+    rules = ROBOT.parent / "rules" / "sga.csv"
+    config = Config(rules=rules)
+    data = policy.describe(config, make_agent(config))
+    steps = []
+    for seed in range(3):
+        robot = parts["SimulatedRobot"](seed=seed)
+        steps.append(parts["Driver"](runtime.Policy(data, seed), robot.answer).trial(1000))
+    arrived = [count for count in steps if count is not None]
+    assert len(arrived) >= 2 and max(arrived) < 650, steps
+    assert robot.physics.plan.goal_radius >= math.dist(
+        robot.physics.position(), robot.physics.plan.goal
+    )
 
 
 @pytest.mark.parametrize(

@@ -42,14 +42,14 @@ class Driver:
         """Drive from the start to the goal; steps of 0.5 s, or None if it did not arrive."""
         self.place.fix(self.policy.robot["start"])
         self.counted, at_goal = (0.0, 0.0), False
-        self._understand(self.ask("start"))
+        self._understand(self.ask("start"), 0.0)
         action: Any = self.policy.start(self.place.pose)
         hold, steps = self.policy.robot["hold"], 0
         while steps < limit:
             left, right = self.policy.command(action)
             line, touching = f"{left:.5f} {right:.5f}", False
             for _ in range(hold):
-                at_goal, touching = self._understand(self.ask(line))
+                at_goal, touching = self._understand(self.ask(line), left + right)
                 steps += 1
                 if touching or at_goal:
                     break
@@ -58,8 +58,8 @@ class Driver:
             action = self.policy.step(self.place.pose)
         return None
 
-    def _understand(self, answer: str) -> tuple[bool, bool]:
-        """Take in a reading; whether the robot is at the goal, and whether it touches a wall.
+    def _understand(self, answer: str, forward: float) -> tuple[bool, bool]:
+        """Take in a reading; whether the robot is at the goal, and whether it drives at a wall.
 
         Encoders count on while lines are lost: the next one makes up for them.
         """
@@ -68,7 +68,7 @@ class Driver:
             return False, False
         left, right, *ranges = map(float, words[:10])
         rolled = left - self.counted[0], right - self.counted[1]
-        walls = felt_walls(ranges, sum(rolled)) if sum(rolled) else []
+        walls = felt_walls(ranges, forward) if forward else []
         self.place.update(*rolled, walls)
         self.counted = left, right
         mark = words[10:]
