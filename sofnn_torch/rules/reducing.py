@@ -23,7 +23,7 @@ from sofnn_torch.evaluate import Loaded
 from sofnn_torch.learners.learner import Learner
 from sofnn_torch.progress import Progress
 from sofnn_torch.rules import tables
-from sofnn_torch.rules.editing import places_of, renewed
+from sofnn_torch.rules.editing import keeping, places_of, renewed
 from sofnn_torch.rules.fitting import Fit
 from sofnn_torch.runs import seeding
 from sofnn_torch.runs.factory import make_agent, make_env
@@ -247,7 +247,8 @@ def reduce_run(
     for home, count in zip(homes, counts, strict=True):
         small.append(reduced(config, agent, count, seed, quiet=False))
         why = {"reduced": {"rules": count, "seed": seed}}
-        run = renewed(source, loaded, small[-1], home, why)
+        kept = keeping(config, small[-1])
+        run = renewed(source, loaded, kept, make_agent(kept), home, why)
         print(f"{run}: {plural(count, 'rule')} instead of {agent.net.n_rules}", flush=True)
     tables.show(table(measured(config, agent, small, TRIALS, seed)))
 
