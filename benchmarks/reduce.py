@@ -6,8 +6,8 @@ chosen by. One row for each rule base goes to the CSV file; rows that are there 
 Prints the table of docs/rules.md and draws its curves.
 
     python benchmarks/reduce.py --runs runs/reduce --out reduced.csv --picture reduced.png
-    python benchmarks/reduce.py --out tasks.csv --tasks MountainCar-v0 CartPole-v1 --seeds 5 \
-        --train 200 --rules 20 10 5
+    python benchmarks/reduce.py --out tasks.csv --tasks MountainCar-v0 CartPole-v1 --train 200 \
+        --seeds 1 5 --rules 20 10 5
 """
 
 import argparse
@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.ticker import NullLocator
 
 from sofnn_torch import training
 from sofnn_torch.evaluate import evaluate, load
@@ -144,10 +145,15 @@ def draw(found: list[Row], path: Path) -> None:
         ax.set(xscale="log", xlabel="rules")
         ax.set_xticks([5, 10, 20, 40, 100, 200, 400, 800], minor=False)
         ax.xaxis.set_major_formatter("{x:.0f}")
-        ax.xaxis.set_minor_locator(figures.matplotlib.ticker.NullLocator())
+        ax.xaxis.set_minor_locator(NullLocator())
+    low, high = left.get_ylim()
     left.set(ylabel="steps, over those of the full policy", yscale="log")
+    left.set_yticks([0.5, 0.8, 0.9, 1, 1.1, 1.2, 1.5, 2, 3, 5, 10, 20, 40])
+    left.set_ylim(min(0.9, low), max(1.2, high))
     left.yaxis.set_major_formatter("{x:g}")
+    left.yaxis.set_minor_locator(NullLocator())
     right.set(ylabel="trials that reach the goal [%]")
+    right.set_ylim(min(90, right.get_ylim()[0]), 101)
     left.legend()
     path.write_bytes(figures.saved(figure, path.suffix[1:]))
 
@@ -161,7 +167,7 @@ def main() -> None:
     parser.add_argument("--picture", type=Path)
     parser.add_argument("--tasks", nargs="+", default=[MAZE])
     parser.add_argument("--agents", nargs="+", default=["sga", "q"])
-    parser.add_argument("--seeds", type=int, default=20, help="from 1 on")
+    parser.add_argument("--seeds", type=int, nargs=2, default=[1, 20], help="first and last")
     parser.add_argument("--train", type=int, default=100, help="trials of each training")
     parser.add_argument("--trials", type=int, default=100, help="that each policy plays")
     parser.add_argument("--rules", type=int, nargs="+", default=[40, 20, 10])
@@ -170,7 +176,7 @@ def main() -> None:
         commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True)
         head = f"# commit {commit.stdout.decode().strip()}, presets, {options.train} trials learned"
         options.out.write_text(f"{head}\n{','.join(COLUMNS)}\n")
-    seeds = range(1, options.seeds + 1)
+    seeds = range(options.seeds[0], options.seeds[1] + 1)
     for task, seed, agent in itertools.product(options.tasks, seeds, options.agents):
         config = Config(env=task, agent=agent, seed=seed, trials=options.train)
         key = {"task": task, "agent": agent, "seed": seed}

@@ -13,6 +13,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 import compiled
 import learning
 import neighbours
+import reduce
 import training
 
 from sofnn_torch.maze.settings import POSE
@@ -102,3 +103,16 @@ def test_the_decision_to_compile_learns_what_the_learner_learns():
         torch.testing.assert_close(
             *(getattr(agent.net, name) for agent in agents), rtol=1e-4, atol=1e-6
         )
+
+
+def test_small_rule_bases_are_compared_with_the_full_one_of_their_seed():
+    task = {"task": "maze", "agent": "sga", "freed": 0, "on_full": 0.5, "on_own": 0.75}
+    steps = {(1, 0): 500, (1, 20): 510, (2, 0): 600, (2, 20): 660}
+    rows = [
+        task | {"seed": seed, "asked": asked, "rules": asked or 700, "steps": n, "outcome": 1.0}
+        for (seed, asked), n in steps.items()
+    ]
+    rows[-1]["outcome"] = 0.99
+    *_, full, small = reduce.table(rows).splitlines()
+    assert full == "| maze, SGA | 700 | 100.00% | 0 of 2 |  | 0 |  |"
+    assert small == "| maze, SGA | 20 | 99.50% | 1 of 2 | +6.0%, +10.0% | 0 | 50.0%, 75.0% |"

@@ -33,7 +33,7 @@ LEFT = {
     r"python3 -m venv|pip install|-m pytest": "the set-up: .ci/run, tests/test_package.py",
     r"^\.ci/run": "runs these tests",
     r"^tensorboard|mkdocs": "serves until it is stopped",
-    r"--reduce|-40-rules|forty\.csv": "needs a policy that has learned; tests/test_reducing.py",
+    r"--reduce|-20-rules": "needs a policy that has learned; tests/test_reducing.py",
     r"--cluster|^dask ": "needs a cluster; tests/test_cluster.py",
     r"--viewer": "needs a display; tests/test_viewer.py",
     r"^python benchmarks/": "takes minutes and other packages; tests/test_benchmarks.py",
