@@ -33,7 +33,7 @@ from sofnn_torch.bounds import Count, Settings, Within
 from sofnn_torch.evaluate import learned, load
 from sofnn_torch.learners.learner import Learner
 from sofnn_torch.pictures import figures, spots
-from sofnn_torch.rules import checks, new, played, tables, terms, why, words
+from sofnn_torch.rules import checks, lab, new, played, tables, terms, why, words
 from sofnn_torch.rules.editing import edited
 from sofnn_torch.rules.reducing import reduce_run
 from sofnn_torch.rules.regions import actions_within
@@ -81,6 +81,8 @@ class Options(Settings):
     """Write all rules to this .json file."""
     csv: Path | None = None
     """Write all rules to this .csv file."""
+    html: Path | None = None
+    """Write the lab to this .html file: a page to look at the rules, change them and drive."""
     picture: Path | None = None
     """Draw the rules into this .png, .svg or .pdf file."""
     load: Path | None = None
@@ -109,7 +111,7 @@ def check(options: Options) -> None:
     if options.name is not None and not options.load and len(options.reduce or ()) != 1:
         raise ValueError("--name goes with --load, or with --reduce and one number")
     RunOptions(name=options.name)
-    outputs = {name: getattr(options, name) for name in ("json", "csv", "picture")}
+    outputs = {name: getattr(options, name) for name in ("json", "csv", "html", "picture")}
     for name, path in outputs.items():
         check_output(f"--{name}", path, PICTURES if name == "picture" else (f".{name}",))
     check_output("--path", options.path, (".csv",))
@@ -288,7 +290,7 @@ def run(options: Options) -> None:
     decisions, outcome = trial.record.decisions, played.outcome(trial.record)
     print(f"one trial without learning or exploration, seed {options.seed}: {outcome}")
     print(tables.summary(shares, decisions, reading))
-    files = [path for path in (options.json, options.csv, options.picture) if path]
+    files = [path for path in (options.json, options.csv, options.html, options.picture) if path]
     if options.words:
         said = terms.sentences(agent, reading, options.words)
         when = played.moments(agent, trial.states)
@@ -297,6 +299,8 @@ def run(options: Options) -> None:
     elif not files:
         tables.show(tables.table(reading, shares, options.top))
     write(options, config, agent, reading, shares)
+    if options.html:
+        lab.write(options.html, options.run, loaded, shares)
     for file in files:
         print(f"written: {file}")
 
