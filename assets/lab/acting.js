@@ -83,7 +83,7 @@ function drag(event) {
   if (held === "pose") moveTo(at);
   else if (held === "nose") turnTo(at);
   else dragRule(at);
-  update({ ground: held !== "pose" || task.inputs.length > 3 + Number(policy.acting), editor: !["pose", "nose"].includes(held) });
+  soon({ ground: held !== "pose" || task.inputs.length > 3 + Number(policy.acting), editor: !["pose", "nose"].includes(held) });
 }
 
 function release() {
@@ -108,8 +108,7 @@ function key(event) {
     showOthers();
     update({ ground: true });
   } else if (event.key === "Enter") {
-    const best = decision.shares.indexOf(Math.max(...decision.shares));
-    choose(rules[best].number);
+    choose(rules[decision.order[0]].number);
   } else if (event.key === " " && maze) driving ? stop() : drive();
   else if (event.key === "Delete" || event.key === "Backspace") removeChosen();
   else if (event.key === "Escape") choose(null);
@@ -254,7 +253,7 @@ function connect() {
     stop();
     view.pose[Number(event.target.dataset.axis)] = Number(event.target.value);
     showOthers();
-    update({ ground: true });
+    soon({ ground: true });
   });
   listen("drive", "click", () => (driving ? stop() : drive()));
   listen("home", "click", () => { stop(); toStart(); update({ ground: true }); });
@@ -280,7 +279,7 @@ function connect() {
     if (begun !== target) remember();
     begun = target;
     change([part, Number(i), target.valueAsNumber / scale]);
-    update({ ground: true, editor: true });
+    soon({ ground: true, editor: true });
   });
   listen("editor", "change", () => { begun = null; update({ list: true, editor: true }); });
   listen("trial", "input", () => { halt(); toTrial(Number($("trial").value)); });
@@ -333,7 +332,7 @@ function begin() {
   describe();
   connect();
   showOthers();
-  decision = decide(policy, view.pose);
+  look();
   layout();
   update({ list: true, editor: true });
   showTrial();

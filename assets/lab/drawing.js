@@ -31,11 +31,14 @@ function tint(s) {
 }
 
 // The range of an input that is worth a look, and of two of them as a map.
+const ranges = [];
+
 function rangeOf(i) {
-  const axis = task.inputs[i];
-  if (axis.low !== null && axis.high !== null) return [axis.low, axis.high];
-  const ends = rules.flatMap((r) => [r.centre[i] - 2 * r.width[i], r.centre[i] + 2 * r.width[i]]);
-  return [axis.low ?? Math.min(...ends), axis.high ?? Math.max(...ends)];
+  if (!ranges[i]) {
+    const axis = task.inputs[i], ends = (way) => first.map((r) => r.centre[i] + way * 2 * r.width[i]);
+    ranges[i] = [axis.low ?? Math.min(...ends(-1)), axis.high ?? Math.max(...ends(1))];
+  }
+  return ranges[i];
 }
 
 function chartOf(w, h) {
@@ -96,44 +99,51 @@ function drawAxes(g, c) {
   g.strokeRect(c.left, c.top, c.w, c.h);
 }
 
-// A tick that leads on, or bends to a side: by a leaning, from a heading or across a chart.
-function hook(g, x, y, s, length, heading) {
-  g.beginPath();
+// Add to a path a tick that leads on, or bends to a side: by a leaning, from a heading or, where
+// that is null, across a chart.
+function hook(path, x, y, s, length, heading) {
+  const bent = Math.abs(s) > 1 / 3;
   if (heading === null) {
-    g.moveTo(x - s * length / 2, y);
-    g.lineTo(x + s * length / 2, y);
-    g.lineTo(x + s * length / 2 - Math.sign(s) * length / 4, y - length / 4);
-    if (Math.abs(s) < 0.15) { g.moveTo(x, y - length / 3); g.lineTo(x, y + length / 3); }
-  } else {
-    const [ux, uy] = [Math.cos(heading), -Math.sin(heading)], bent = Math.abs(s) > 1 / 3;
-    const [mx, my] = [x + ux * length * (bent ? 0.6 : 1), y + uy * length * (bent ? 0.6 : 1)];
-    g.moveTo(x, y);
-    g.lineTo(mx, my);
-    if (bent) g.lineTo(mx + Math.sign(s) * uy * length * 0.55, my - Math.sign(s) * ux * length * 0.55);
+    const half = bent ? (Math.sign(s) * length) / 2 : 0;
+    path.moveTo(x - half, y + (bent ? 0 : length / 3));
+    path.lineTo(x + half, y - (bent ? 0 : length / 3));
+    if (bent) path.lineTo(x + half - Math.sign(s) * length / 4, y - length / 4);
+    return;
   }
-  g.stroke();
+  const [ux, uy] = [Math.cos(heading), -Math.sin(heading)], far = length * (bent ? 0.6 : 1);
+  path.moveTo(x, y);
+  path.lineTo(x + ux * far, y + uy * far);
+  const aside = Math.sign(s) * length * 0.55;
+  if (bent) path.lineTo(x + ux * far + uy * aside, y + uy * far - ux * aside);
 }
 
-// A triangle that points to a side, or a dot: by a leaning.
-function mark(g, x, y, s, r) {
-  if (Math.abs(s) <= 1 / 3) circle(g, x, y, 0.8 * r);
-  else {
-    const way = Math.sign(s) * r;
-    g.beginPath();
-    g.moveTo(x + 1.3 * way, y);
-    g.lineTo(x - way, y - r);
-    g.lineTo(x - way, y + r);
-    g.closePath();
+// Add a triangle that points to a side, or a dot: by a leaning.
+function mark(path, x, y, s, r) {
+  const way = Math.sign(s) * r;
+  if (Math.abs(s) <= 1 / 3) {
+    path.moveTo(x + 0.8 * r, y);
+    path.arc(x, y, 0.8 * r, 0, 2 * Math.PI);
+    return;
   }
-  g.fill();
+  path.moveTo(x + 1.3 * way, y);
+  path.lineTo(x - way, y - r);
+  path.lineTo(x - way, y + r);
+  path.closePath();
+}
+
+// Draw one hook.
+function tick(g, ...where) {
+  g.beginPath();
+  hook(g, ...where);
+  g.stroke();
 }
 
 function drawField(g, c, fine) {
   if (view.field === "none") return;
-  const columns = fine ? 72 : 30, rows = Math.max(8, Math.round(columns * c.h / c.w));
+  const columns = fine ? 72 : 24, rows = Math.max(8, Math.round(columns * c.h / c.w));
   const us = Array.from({ length: columns }, (_, i) => c.x0 + (i + 0.5) * (c.x1 - c.x0) / columns);
   const vs = Array.from({ length: rows }, (_, i) => c.y0 + (i + 0.5) * (c.y1 - c.y0) / rows);
-  const { leanings, values } = fieldOf(policy, view.pose, view.a, view.b, us, vs);
+  const { leanings, values } = fieldOf(policy, view.pose, view.a, view.b, us, vs, view.field);
   const [cw, ch] = [c.w / columns, c.h / rows];
   let [low, high] = [Infinity, -Infinity];
   for (const v of values) { low = Math.min(low, v); high = Math.max(high, v); }
@@ -160,7 +170,7 @@ function drawField(g, c, fine) {
         const s = leanings[j * columns + i];
         g.strokeStyle = tint(s);
         g.globalAlpha = Math.abs(s) > 1 / 3 ? 0.5 : 0.3;
-        hook(g, c.px(us[i]), c.py(vs[j]), s, Math.abs(s) > 1 / 3 ? 10 : 6, heading);
+        tick(g, c.px(us[i]), c.py(vs[j]), s, Math.abs(s) > 1 / 3 ? 10 : 6, heading);
       }
     }
   }
@@ -206,28 +216,35 @@ function aboutUnseen(k) {
   return Math.exp(log);
 }
 
+// Rules of one colour and paleness are drawn at once.
 function drawRules(g, c, listed) {
-  const most = Math.max(...rules.map((r) => r.usage || 0), 1e-9);
+  const most = Math.max(...rules.map((r) => r.usage || 0), 1e-9), groups = new Map(), fresh = new Path2D();
   for (const k of listed) {
-    const rule = rules[k], s = leaning(policy, voteOf(rule)), heading = maze ? rule.centre[2] : null;
-    const [x, y] = [c.px(rule.centre[view.a]), c.py(rule.centre[view.b])];
-    g.globalAlpha = 0.14 + 0.86 * aboutUnseen(k);
-    g.strokeStyle = g.fillStyle = tint(s);
+    const rule = rules[k], s = leaning(policy, voteOf(rule)), near = Math.round(5 * aboutUnseen(k)) / 5;
+    const [x, y] = [c.px(rule.centre[view.a]), c.py(rule.centre[view.b])], key = `${tint(s)} ${near}`;
     const r = 1.6 + 3 * Math.sqrt((rule.usage || 0) / most);
-    g.lineWidth = 1.4;
+    if (!groups.has(key)) groups.set(key, { colour: tint(s), near, dots: new Path2D(), hooks: new Path2D() });
+    const { dots, hooks } = groups.get(key);
     if (maze) {
-      circle(g, x, y, r);
-      g.fill();
-      hook(g, x, y, s, 13, heading);
-    } else mark(g, x, y, s, r + 2);
+      dots.moveTo(x + r, y);
+      dots.arc(x, y, r, 0, 2 * Math.PI);
+      hook(hooks, x, y, s, 13, rule.centre[2]);
+    } else mark(dots, x, y, s, r + 2);
     if (rule.born === view.trial && view.trial < data.trial) {
-      g.globalAlpha = 1;
-      g.strokeStyle = ink("accent");
-      circle(g, x, y, 8);
-      g.stroke();
+      fresh.moveTo(x + 8, y);
+      fresh.arc(x, y, 8, 0, 2 * Math.PI);
     }
   }
+  g.lineWidth = 1.4;
+  for (const { colour, near, dots, hooks } of [...groups.values()].sort((p, q) => p.near - q.near)) {
+    g.globalAlpha = 0.14 + 0.86 * near;
+    g.strokeStyle = g.fillStyle = colour;
+    g.fill(dots);
+    g.stroke(hooks);
+  }
   g.globalAlpha = 1;
+  g.strokeStyle = ink("accent");
+  g.stroke(fresh);
 }
 
 // All but the pose. A fine field takes longer; while something is dragged a coarse one is enough.
@@ -301,8 +318,7 @@ function drawChosen(g, c, rule) {
 // Rings around the rules that decide here: whole for the decision, broken against it.
 function drawVoices(g, c) {
   const { shares, support } = decision;
-  const order = [...shares.keys()].filter((k) => shares[k] > 0.01).sort((p, q) => shares[q] - shares[p]);
-  order.slice(0, 12).forEach((k, place) => {
+  decision.order.filter((k) => shares[k] > 0.01).slice(0, 12).forEach((k, place) => {
     const rule = rules[k], [x, y] = [c.px(rule.centre[view.a]), c.py(rule.centre[view.b])];
     const against = support[k] < 0, r = 4 + 16 * Math.sqrt(shares[k]);
     g.lineWidth = 1.6;
@@ -314,8 +330,12 @@ function drawVoices(g, c) {
     if (view.which === "here") {
       const s = leaning(policy, voteOf(rule));
       g.strokeStyle = g.fillStyle = tint(s);
-      if (maze) hook(g, x, y, s, 13, rule.centre[2]);
-      else mark(g, x, y, s, 5);
+      if (maze) tick(g, x, y, s, 13, rule.centre[2]);
+      else {
+        g.beginPath();
+        mark(g, x, y, s, 5);
+        g.fill();
+      }
     }
     if (place < 4) {
       g.textAlign = "left";
@@ -349,7 +369,7 @@ function drawRobot(g, c) {
   g.stroke();
   g.strokeStyle = tint(leaning(policy, decision));
   g.lineWidth = 3;
-  hook(g, x + r * Math.cos(heading), y - r * Math.sin(heading), leaning(policy, decision), 18, heading);
+  tick(g, x + r * Math.cos(heading), y - r * Math.sin(heading), leaning(policy, decision), 18, heading);
   g.lineWidth = 2;
   g.strokeStyle = ink("robot");
   g.beginPath();

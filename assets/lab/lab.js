@@ -14,7 +14,8 @@ let rules = data.rules.map((row, k) => ({
 }));
 const first = rules, past = [], future = [];
 let policy = makePolicy(task, rules), decision = null;
-let votes = new Map(), together = null;  // of rules by themselves, and of all at their centres
+const votes = new WeakMap();  // of rules by themselves
+let together = new Map();  // whether a rule is outvoted
 
 const view = {
   pose: startPose(), a: 0, b: task.axes.length > 1 ? 1 : 0, field: "action", which: "listed",
@@ -42,7 +43,6 @@ function voteOf(rule) {
 // Whether all rules together choose something else at the centre of a rule, as in words.py.
 function isOutvoted(rule) {
   if (task.decision.action_input || !task.choices.length) return false;
-  if (!together) together = new Map();
   if (!together.has(rule)) {
     const mine = voteOf(rule).choice;
     const theirs = mine === null ? null : decide(policy, rule.centre).choice;
@@ -56,8 +56,7 @@ function isOutvoted(rule) {
 // Take a list of rules in the place of the present one.
 function put(list) {
   rules = list;
-  votes = new Map([...votes].filter(([rule]) => list.includes(rule) && rule.number !== view.chosen));
-  together = null;
+  together = new Map();
   policy = makePolicy(task, rules);
 }
 
@@ -71,7 +70,6 @@ function remember() {
 function undo(from = past, to = future) {
   if (!from.length) return;
   to.push(rules);
-  votes.clear();
   put(from.pop());
   update({ ground: true, list: true, editor: true });
 }
@@ -149,11 +147,32 @@ function say(words) {
 
 // ------------------------------------------------------------------------------------- showing
 
-let refining = 0;
+let refining = 0, waiting = null;
+
+// Decide at the pose; rules in the order of their shares.
+function look() {
+  decision = decide(policy, view.pose);
+  const { shares } = decision, order = [...shares.keys()].filter((k) => shares[k] > 1e-4);
+  decision.order = order.sort((p, q) => shares[q] - shares[p]);
+}
+
+// Show it with the next picture of the screen, however often something moves until then.
+function soon(what) {
+  if (waiting) {
+    for (const [part, wanted] of Object.entries(what)) waiting[part] ||= wanted;
+    return;
+  }
+  waiting = what;
+  requestAnimationFrame(() => {
+    const asked = waiting;
+    waiting = null;
+    update(asked);
+  });
+}
 
 // Show what changed: the pose always; the ground, the list of rules, the editor where asked for.
 function update({ ground = false, list = false, editor = false, fine = false } = {}) {
-  decision = decide(policy, view.pose);
+  look();
   if (ground) {
     clearTimeout(refining);
     drawGround(fine);

@@ -16,14 +16,15 @@ function escaped(what) {
 
 function showHere() {
   const { shares, support } = decision;
+  const order = decision.order.slice(0, 6);  // pictures first: they ask for sizes, texts change them
+  drawScale();
+  drawMemberships(order.slice(0, SERIES.length));
   const place = task.axes.map((axis, i) => `${axis.name} ${placeOn(axis, view.pose[i])}`).join(", ");
   $("place").textContent = place;
   $("action").innerHTML = swatch(leaning(policy, decision)) + escaped(actionName(task, decision));
   $("reason").textContent = reason(policy, decision);
   $("account").textContent = account(policy, decision);
   $("known").textContent = known(decision.strongest, task.theta);
-  drawScale();
-  const order = [...shares.keys()].sort((p, q) => shares[q] - shares[p]).slice(0, 6);
   const most = Math.max(...order.map((k) => Math.abs(support[k])), 1e-12);
   $("voices").tBodies[0].innerHTML = order.map((k, row) => {
     const rule = rules[k], vote = voteOf(rule), far = support[k] / most;
@@ -36,7 +37,6 @@ function showHere() {
       <td>${swatch(leaning(policy, vote))}${escaped(actionName(task, vote))}</td>
       <td><div class="tug" title="${said} the decision by ${fixed(Math.abs(support[k]), 3)}">${bar}<span class="unseen">${said}</span></div></td></tr>`;
   }).join("");
-  drawMemberships(order.slice(0, SERIES.length));
   $("map").setAttribute("aria-label", `Map of the rules. At ${place}: ${reason(policy, decision)}`);
 }
 

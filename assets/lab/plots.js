@@ -15,19 +15,20 @@ function text(g, what, x, y, align = "center", colour = "quiet", baseline = "mid
 function drawScale() {
   const canvas = $("scale"), { values, choice } = decision, { task: { choices, actions, decision: how } } = policy;
   const rows = values ? Math.min(values.length, 9) : 0;
-  canvas.style.height = `${values ? 20 * rows + 4 : 34 + 26 * (how.numbers - 1) + 8}px`;
+  const high = `${values ? 20 * rows + 4 : 34 + 26 * (how.numbers - 1) + 8}px`;
+  if (canvas.style.height !== high) canvas.style.height = high;
   const { g, w } = paper(canvas);
   if (values) {
     const order = [...values.keys()].sort((p, q) => values[q] - values[p]).slice(0, rows).sort((p, q) => p - q);
-    const [low, high] = [Math.min(...values), Math.max(...values)], room = w - 190;
+    const [low, top] = [Math.min(...values), Math.max(...values)], room = w - 190;
     order.forEach((j, row) => {
-      const y = 10 + 20 * row, length = 4 + (room - 4) * (high > low ? (values[j] - low) / (high - low) : 1);
+      const y = 10 + 20 * row, length = 4 + (room - 4) * (top > low ? (values[j] - low) / (top - low) : 1);
       text(g, choices[j], 110, y, "right", j === choice ? "ink" : "quiet");
       g.fillStyle = ink(j === choice ? "ink" : "quiet");
       g.globalAlpha = j === choice ? 1 : 0.45;
       g.fillRect(118, y - 5, length, 10);
       g.globalAlpha = 1;
-      text(g, fixed(values[j], Math.abs(high - low) < 0.1 ? 4 : 2), 124 + length, y, "left", j === choice ? "ink" : "quiet");
+      text(g, fixed(values[j], top - low < 0.1 ? 4 : 2), 124 + length, y, "left", j === choice ? "ink" : "quiet");
     });
     return;
   }

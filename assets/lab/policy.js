@@ -92,7 +92,7 @@ function conclude(policy, x, outputs) {
   const [out] = outputs, m = decision.numbers;
   const value = policy.valued ? out[policy.m - 1] : null;
   if (!discrete) {
-    const action = out.slice(0, m).map((v) => Math.fround(Math.min(Math.max(v, -1), 1)));
+    const action = Array.from(out).slice(0, m).map((v) => Math.fround(Math.min(Math.max(v, -1), 1)));
     return { choice: null, values: null, value, action };
   }
   const choice = decision.edges.filter((edge) => edge < out[0]).length;
@@ -170,17 +170,19 @@ function leaning(policy, { choice, action, undecided }) {
 }
 
 // The policy on a grid over inputs a and b, the others as observed. Rows of leaning and value.
-// A firing strength is a product of memberships, so each axis is computed once.
-function fieldOf(policy, observation, a, b, us, vs) {
-  const { K, m, n } = policy, x = stateOf(policy, observation);
+//
+// A firing strength is a product of memberships, so each axis is computed once. In a row of the
+// grid only the rules that reach it count; where the sum shows that those are too few, all do, and
+// far from every rule decide() adds in logarithms. Good to four digits, for drawing.
+function fieldOf(policy, observation, a, b, us, vs, wanted = "action") {
+  const { K, m, n } = policy, x = stateOf(policy, observation), at = [...observation];
   const along = (i, values) => values.map((v) => {
-    const at = [...observation];
-    at[i] = v;
-    const seen = stateOf(policy, at)[i], row = new Float64Array(K);
+    const there = [...observation], row = new Float64Array(K);
+    there[i] = v;
+    const seen = stateOf(policy, there)[i];
     for (let k = 0; k < K; k++) row[k] = Math.exp(logMembership(policy, k, i, seen));
     return row;
   });
-  const across = along(a, us), up = along(b, vs);
   const rest = inputsAt(policy, x).map((inputs) => {
     const row = new Float64Array(K);
     for (let k = 0; k < K; k++) {
@@ -190,34 +192,63 @@ function fieldOf(policy, observation, a, b, us, vs) {
     }
     return row;
   });
-  const used = [];  // columns of the consequents that are not all zero
-  for (let j = 0; j < m; j++) {
+  const across = along(a, us), columns = usedColumns(policy, wanted).map((j) => {
     const column = new Float64Array(K);
     for (let k = 0; k < K; k++) column[k] = policy.consequents[k * m + j];
-    if (column.some((v) => v !== 0)) used.push([j, column]);
-  }
+    return [j, column];
+  });
   const leanings = new Float32Array(us.length * vs.length), values = new Float32Array(leanings.length);
-  const weights = new Float64Array(K), at = [...observation];
-  vs.forEach((v, row) => us.forEach((u, column) => {
-    at[a] = u;
-    at[b] = v;
-    let faint = false;
-    const outputs = rest.map((others) => {
-      const [p, q] = [across[column], up[row]], out = new Array(m).fill(0);
-      let sum = 0;
-      for (let k = 0; k < K; k++) sum += weights[k] = p[k] * q[k] * others[k];
-      if (sum < 1e-200) faint = true;  // far from every rule: in logarithms, as in decide()
-      for (const [j, c] of used) {
-        let total = 0;
-        for (let k = 0; k < K; k++) total += weights[k] * c[k];
-        out[j] = total / sum;
-      }
-      return out;
+  // Numbers of the rules above a strength side by side: weights but for the first axis, consequents.
+  const packed = (q, others, least) => {
+    const ks = new Uint32Array(K), strength = new Float64Array(K);
+    let count = 0;
+    for (let k = 0; k < K; k++) {
+      const w = q[k] * others[k];
+      if (w > least) { ks[count] = k; strength[count++] = w; }
+    }
+    const consequents = columns.map(([, column]) => {
+      const some = new Float64Array(count);
+      for (let r = 0; r < count; r++) some[r] = column[ks[r]];
+      return some;
     });
-    const found = faint ? decide(policy, at) : conclude(policy, stateOf(policy, at), outputs);
-    const place = row * us.length + column;
-    leanings[place] = leaning(policy, found);
-    values[place] = found.value ?? 0;
-  }));
+    return { ks, count, strength, consequents };
+  };
+  const weights = new Float64Array(K);
+  const mean = (p, some, out) => {
+    const { ks, count, strength, consequents } = some;
+    let sum = 0;
+    for (let r = 0; r < count; r++) sum += weights[r] = p[ks[r]] * strength[r];
+    for (let i = 0; i < columns.length; i++) {
+      const c = consequents[i];
+      let total = 0;
+      for (let r = 0; r < count; r++) total += weights[r] * c[r];
+      out[columns[i][0]] = total / sum;
+    }
+    return sum;
+  };
+  along(b, vs).forEach((q, row) => {
+    const reach = rest.map((others) => packed(q, others, 1e-10)), every = rest.map(() => null);
+    const outputs = rest.map(() => new Float64Array(m));
+    at[b] = vs[row];
+    us.forEach((u, column) => {
+      at[a] = u;
+      const faint = outputs.some((out, i) => mean(across[column], reach[i], out) < 1e-3
+        && !(mean(across[column], every[i] ||= packed(q, rest[i], -1), out) > 1e-200));
+      const found = faint ? decide(policy, at) : conclude(policy, stateOf(policy, at), outputs);
+      const place = row * us.length + column;
+      leanings[place] = leaning(policy, found);
+      values[place] = found.value ?? 0;
+    });
+  });
   return { leanings, values };
+}
+
+// Columns of the consequents that a drawing needs: not those that are zero in every rule.
+function usedColumns(policy, wanted) {
+  const { m, K, consequents, task } = policy, normal = task.decision.kind === "normal";
+  return Array.from({ length: m }, (_, j) => j).filter((j) => {
+    if (normal) return wanted === "value" ? j === m - 1 : j < task.decision.numbers;
+    for (let k = 0; k < K; k++) if (consequents[k * m + j] !== 0) return true;
+    return false;
+  });
 }

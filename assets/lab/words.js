@@ -61,8 +61,8 @@ function listed(names) {
 // The rules that speak most for a decision and most against it. Numbers of rules count from 1.
 function voices(decision, most = 3, least = 0.03) {
   const { support } = decision, total = support.reduce((sum, v) => sum + Math.abs(v), 0) || 1;
-  const order = [...support.keys()].sort((a, b) => Math.abs(support[b]) - Math.abs(support[a]));
-  const loud = order.slice(0, 40).filter((k) => Math.abs(support[k]) > least * total);
+  const loud = [...support.keys()].filter((k) => Math.abs(support[k]) > least * total);
+  loud.sort((a, b) => Math.abs(support[b]) - Math.abs(support[a]));
   return {
     pro: loud.filter((k) => support[k] > 0).slice(0, most),
     contra: loud.filter((k) => support[k] < 0).slice(0, most),
