@@ -140,7 +140,7 @@ function tick(g, ...where) {
 
 function drawField(g, c, fine) {
   if (view.field === "none") return;
-  const columns = fine ? 72 : 24, rows = Math.max(8, Math.round(columns * c.h / c.w));
+  const columns = fine ? 72 : view.coarse, rows = Math.max(6, Math.round(columns * c.h / c.w));
   const us = Array.from({ length: columns }, (_, i) => c.x0 + (i + 0.5) * (c.x1 - c.x0) / columns);
   const vs = Array.from({ length: rows }, (_, i) => c.y0 + (i + 0.5) * (c.y1 - c.y0) / rows);
   const { leanings, values } = fieldOf(policy, view.pose, view.a, view.b, us, vs, view.field);

@@ -20,7 +20,7 @@ let together = new Map();  // whether a rule is outvoted
 const view = {
   pose: startPose(), a: 0, b: task.axes.length > 1 ? 1 : 0, field: "action", which: "listed",
   trial: data.trial, chosen: null, trail: [], chart: null, values: [0, 1],
-  sort: ["usage", -1], all: false,
+  sort: ["usage", -1], all: false, coarse: 24,  // columns of the field while something moves
 };
 
 function startPose() {
@@ -175,7 +175,9 @@ function update({ ground = false, list = false, editor = false, fine = false } =
   look();
   if (ground) {
     clearTimeout(refining);
+    const begun = performance.now();
     drawGround(fine);
+    if (!fine && performance.now() - begun > 8) view.coarse = Math.max(8, Math.round(0.8 * view.coarse));
     if (!fine) refining = setTimeout(() => drawGround(true), 120);
   }
   drawMap();
