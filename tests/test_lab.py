@@ -18,7 +18,8 @@ from sofnn_torch.learners.learner import Task
 from sofnn_torch.maze.layouts import assets
 from sofnn_torch.network.axes import named
 from sofnn_torch.network.sofnn import SOFNN
-from sofnn_torch.rules import files, lab
+from sofnn_torch.rules import lab
+from sofnn_torch.runs import rule_files
 from sofnn_torch.runs.settings import Config
 
 DATA = re.compile(r'<script type="application/json" id="data">(.*?)</script>', re.DOTALL)
@@ -62,7 +63,7 @@ def test_the_rules_in_a_page_are_those_of_the_learner_to_the_last_bit():
     _, agent, _ = content(rules=200)
     data = json.loads(DATA.search(page(rules=200))[1])
     np.testing.assert_array_equal(np.array(data["rules"], np.float32), parameters(agent))
-    assert data["head"] == files.schema(agent).head
+    assert data["head"] == rule_files.schema(agent).head
 
 
 def test_no_name_ends_the_data_of_a_page():
