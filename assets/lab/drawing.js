@@ -1,185 +1,81 @@
 "use strict";
 // The map: field, walls and rules on the ground; the pose and the chosen rule above it.
 
-const inks = new Map();  // colours of the style, by name; cleared when light becomes dark
+// The field of the map for what the page shows now, with as little work as the changes need: a few
+// changed rules are exchanged; where the state moved all are summed.
+let drawn = null, refining = 0;
+const SLOW = 10;  // ms of a sum, from which a coarse field stands in while something moves
 
-function ink(name) {
-  if (!inks.has(name)) {
-    inks.set(name, getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim());
-  }
-  return inks.get(name);
+function fieldNow(a, b, us, vs, wanted) {
+  const kept = drawn && drawn.a === a && drawn.b === b && drawn.wanted === wanted && drawn.policy.K === policy.K
+    && String([drawn.us, drawn.vs]) === String([us, vs]) && String(drawn.columns) === String(usedColumns(policy, wanted));
+  const changed = kept ? [...rules.keys()].filter((k) => rules[k] !== drawn.policy.rules[k]) : [];
+  const anew = !kept || changed.length > 5, moved = anew || hasMoved();
+  if (anew) drawn = makeField(policy, a, b, us, vs, wanted);
+  else if (changed.length && !moved) swapRules(drawn, policy, changed);
+  else if (changed.length) drawn = makeField(policy, a, b, us, vs, wanted);
+  if (moved) sumField(drawn, view.pose);
+  return readField(drawn);
 }
 
-// A canvas cleared and scaled to the pixels of the screen.
-function paper(canvas) {
-  const ratio = window.devicePixelRatio || 1, w = canvas.clientWidth, h = canvas.clientHeight;
-  if (canvas.width !== Math.round(w * ratio) || canvas.height !== Math.round(h * ratio)) {
-    canvas.width = Math.round(w * ratio);
-    canvas.height = Math.round(h * ratio);
-  }
-  const g = canvas.getContext("2d");
-  g.setTransform(ratio, 0, 0, ratio, 0, 0);
-  g.clearRect(0, 0, w, h);
-  g.lineCap = g.lineJoin = "round";
-  g.font = "12px system-ui, 'DejaVu Sans', sans-serif";
-  return { g, w, h };
+// Whether the inputs that the map does not show are others than those of its field.
+function hasMoved() {
+  return !drawn || view.pose.some((v, i) => i !== view.a && i !== view.b && v !== drawn.observation[i]);
 }
 
-// Colour of a leaning from -1 to 1.
-function tint(s) {
-  return ink(s < -1 / 3 ? "right" : s > 1 / 3 ? "left" : "straight");
+function rgb(name) {
+  return [1, 3, 5].map((i) => parseInt(ink(name).slice(i, i + 2), 16));
 }
 
-// The range of an input that is worth a look, and of two of them as a map.
-const ranges = [];
-
-function rangeOf(i) {
-  if (!ranges[i]) {
-    const axis = task.inputs[i], ends = (way) => first.map((r) => r.centre[i] + way * 2 * r.width[i]);
-    ranges[i] = [axis.low ?? Math.min(...ends(-1)), axis.high ?? Math.max(...ends(1))];
-  }
-  return ranges[i];
-}
-
-function chartOf(w, h) {
-  const [left, right, top, bottom] = [maze ? 42 : 56, maze ? 12 : 20, 8, 36];
-  let [[x0, x1], [y0, y1]] = [rangeOf(view.a), rangeOf(view.b)];
-  if (maze) {
-    x0 = Math.min(...maze.walls.map((b) => b[0]));
-    x1 = Math.max(...maze.walls.map((b) => b[2]));
-    y0 = Math.min(...maze.walls.map((b) => b[1]));
-    y1 = Math.max(...maze.walls.map((b) => b[3]));
-  }
-  let [sx, sy] = [(w - left - right) / (x1 - x0), (h - top - bottom) / (y1 - y0)];
-  if (maze) sx = sy = Math.min(sx, sy);
-  return {
-    x0, x1, y0, y1, sx, sy, w: (x1 - x0) * sx, h: (y1 - y0) * sy, left, top,
-    px: (x) => left + (x - x0) * sx, py: (y) => top + (y1 - y) * sy,
-    x: (px) => x0 + (px - left) / sx, y: (py) => y1 - (py - top) / sy,
-  };
-}
-
-// Height of the map for its width.
-function mapHeight(w) {
-  if (!maze) return Math.round(Math.min(0.8 * w, 620));
-  const c = chartOf(w, 1e6);
-  return Math.min(c.h + 44, 760);
-}
-
-function ticks(low, high, most = 6) {
-  const rough = (high - low) / most, power = 10 ** Math.floor(Math.log10(rough));
-  const step = power * [1, 2, 5, 10].find((f) => f * power >= rough);
-  const out = [];
-  for (let v = Math.ceil(low / step - 1e-9) * step; v <= high + 1e-9 * step; v += step) out.push(v);
-  return { step, at: out };
-}
-
-function drawAxes(g, c) {
-  g.fillStyle = ink("quiet");
-  g.strokeStyle = ink("line");
-  g.lineWidth = 1;
-  for (const [i, horizontal] of [[view.a, true], [view.b, false]]) {
-    const { scale, unit } = shown(task.inputs[i]), [low, high] = horizontal ? [c.x0, c.x1] : [c.y0, c.y1];
-    const { at, step } = ticks(low * scale, high * scale);
-    const digits = Math.max(0, -Math.floor(Math.log10(step) + 1e-9));
-    g.textAlign = horizontal ? "center" : "right";
-    g.textBaseline = horizontal ? "top" : "middle";
-    for (const v of at) {
-      const text = fixed(v, digits);
-      if (horizontal) g.fillText(text, c.px(v / scale), c.top + c.h + 5);
-      else g.fillText(text, c.left - 6, c.py(v / scale));
-    }
-    const name = task.inputs[i].name + (unit ? ` [${unit}]` : "");
-    g.save();
-    if (horizontal) g.translate(c.left + c.w / 2, c.top + c.h + 21);
-    else { g.translate(2, c.top + c.h / 2); g.rotate(-Math.PI / 2); g.textBaseline = "top"; g.textAlign = "center"; }
-    g.fillText(name, 0, horizontal ? 0 : -1);
-    g.restore();
-  }
-  g.strokeRect(c.left, c.top, c.w, c.h);
-}
-
-// Add to a path a tick that leads on, or bends to a side: by a leaning, from a heading or, where
-// that is null, across a chart.
-function hook(path, x, y, s, length, heading) {
-  const bent = Math.abs(s) > 1 / 3;
-  if (heading === null) {
-    const half = bent ? (Math.sign(s) * length) / 2 : 0;
-    path.moveTo(x - half, y + (bent ? 0 : length / 3));
-    path.lineTo(x + half, y - (bent ? 0 : length / 3));
-    if (bent) path.lineTo(x + half - Math.sign(s) * length / 4, y - length / 4);
-    return;
-  }
-  const [ux, uy] = [Math.cos(heading), -Math.sin(heading)], far = length * (bent ? 0.6 : 1);
-  path.moveTo(x, y);
-  path.lineTo(x + ux * far, y + uy * far);
-  const aside = Math.sign(s) * length * 0.55;
-  if (bent) path.lineTo(x + ux * far + uy * aside, y + uy * far - ux * aside);
-}
-
-// Add a triangle that points to a side, or a dot: by a leaning.
-function mark(path, x, y, s, r) {
-  const way = Math.sign(s) * r;
-  if (Math.abs(s) <= 1 / 3) {
-    path.moveTo(x + 0.8 * r, y);
-    path.arc(x, y, 0.8 * r, 0, 2 * Math.PI);
-    return;
-  }
-  path.moveTo(x + 1.3 * way, y);
-  path.lineTo(x - way, y - r);
-  path.lineTo(x - way, y + r);
-  path.closePath();
-}
-
-// Draw one hook.
-function tick(g, ...where) {
-  g.beginPath();
-  hook(g, ...where);
-  g.stroke();
-}
+const tile = document.createElement("canvas");  // a pixel for each cell
 
 function drawField(g, c, fine) {
   if (view.field === "none") return;
-  const columns = fine ? 72 : view.coarse, rows = Math.max(6, Math.round(columns * c.h / c.w));
-  const us = Array.from({ length: columns }, (_, i) => c.x0 + (i + 0.5) * (c.x1 - c.x0) / columns);
+  const coarse = !fine && view.pace > SLOW && hasMoved();
+  clearTimeout(refining);
+  if (coarse) refining = setTimeout(() => drawGround(true), 150);
+  const begun = performance.now(), cols = coarse ? 36 : 72, rows = Math.max(6, Math.round(cols * c.h / c.w));
+  const us = Array.from({ length: cols }, (_, i) => c.x0 + (i + 0.5) * (c.x1 - c.x0) / cols);
   const vs = Array.from({ length: rows }, (_, i) => c.y0 + (i + 0.5) * (c.y1 - c.y0) / rows);
-  const { leanings, values } = fieldOf(policy, view.pose, view.a, view.b, us, vs, view.field);
-  const [cw, ch] = [c.w / columns, c.h / rows];
+  const moves = hasMoved(), { leanings, values } = fieldNow(view.a, view.b, us, vs, view.field);
+  if (moves && !coarse) view.pace = performance.now() - begun;
   let [low, high] = [Infinity, -Infinity];
   for (const v of values) { low = Math.min(low, v); high = Math.max(high, v); }
   view.values = [low, high];
-  for (let j = 0; j < rows; j++) {
-    for (let i = 0; i < columns; i++) {
-      const s = leanings[j * columns + i], v = (values[j * columns + i] - low) / (high - low || 1);
-      if (view.field === "value") {
-        g.fillStyle = ink("value");
-        g.globalAlpha = 0.04 + 0.6 * Math.round(v * 10) / 10;
-      } else {
-        g.fillStyle = tint(s);
-        g.globalAlpha = Math.abs(s) < 1 / 3 ? 0.03 : 0.2;
-      }
-      const [x, y] = [Math.round(c.left + i * cw), Math.round(c.top + c.h - (j + 1) * ch)];
-      g.fillRect(x, y, Math.round(c.left + (i + 1) * cw) - x, Math.round(c.top + c.h - j * ch) - y);
-    }
+  [tile.width, tile.height] = [cols, rows];
+  const brush = tile.getContext("2d"), image = brush.createImageData(cols, rows);
+  const [value, sides] = [rgb("value"), [rgb("right"), rgb("straight"), rgb("left")]];
+  for (let cell = 0; cell < cols * rows; cell++) {
+    const s = leanings[cell], side = s < -1 / 3 ? 0 : s > 1 / 3 ? 2 : 1;
+    const dark = view.field === "value" ? 0.04 + 0.06 * Math.round(10 * (values[cell] - low) / (high - low || 1)) : side === 1 ? 0.03 : 0.2;
+    const at = 4 * ((rows - 1 - Math.floor(cell / cols)) * cols + cell % cols);
+    image.data.set(view.field === "value" ? value : sides[side], at);
+    image.data[at + 3] = 255 * dark;
   }
-  const every = Math.max(1, Math.round(columns / (c.w / 34))), heading = maze ? view.pose[2] : null;
-  g.lineWidth = 1;
-  if (view.field === "action") {
-    for (let j = every >> 1; j < rows; j += every) {
-      for (let i = every >> 1; i < columns; i += every) {
-        const s = leanings[j * columns + i];
-        g.strokeStyle = tint(s);
-        g.globalAlpha = Math.abs(s) > 1 / 3 ? 0.5 : 0.3;
-        tick(g, c.px(us[i]), c.py(vs[j]), s, Math.abs(s) > 1 / 3 ? 10 : 6, heading);
-      }
-    }
-  }
-  g.globalAlpha = 1;
+  brush.putImageData(image, 0, 0);
+  g.imageSmoothingEnabled = false;
+  g.drawImage(tile, c.left, c.top, c.w, c.h);
+  if (view.field === "action") drawHooks(g, c, us, vs, leanings);
 }
 
-function circle(g, x, y, r) {
-  g.beginPath();
-  g.arc(x, y, r, 0, 2 * Math.PI);
+// Hooks for what is done, every few cells; those of one side at once.
+function drawHooks(g, c, us, vs, leanings) {
+  const cols = us.length, every = Math.max(1, Math.round(cols / (c.w / 34))), heading = maze ? view.pose[2] : null;
+  const paths = new Map();
+  for (let j = every >> 1; j < vs.length; j += every) {
+    for (let i = every >> 1; i < cols; i += every) {
+      const s = leanings[j * cols + i], bent = Math.abs(s) > 1 / 3, key = tint(s);
+      if (!paths.has(key)) paths.set(key, { path: new Path2D(), bent });
+      hook(paths.get(key).path, c.px(us[i]), c.py(vs[j]), s, bent ? 10 : 6, heading);
+    }
+  }
+  g.lineWidth = 1;
+  for (const [colour, { path, bent }] of paths) {
+    g.strokeStyle = colour;
+    g.globalAlpha = bent ? 0.5 : 0.3;
+    g.stroke(path);
+  }
+  g.globalAlpha = 1;
 }
 
 function drawMaze(g, c) {
@@ -247,8 +143,8 @@ function drawRules(g, c, listed) {
   g.stroke(fresh);
 }
 
-// All but the pose. A fine field takes longer; while something is dragged a coarse one is enough.
-function drawGround(fine) {
+// All but the pose; the field as fine as it is worth a wait.
+function drawGround(fine = false) {
   const { g, w, h } = paper($("ground")), c = chartOf(w, h);
   view.chart = c;
   g.save();

@@ -20,7 +20,7 @@ let together = new Map();  // whether a rule is outvoted
 const view = {
   pose: startPose(), a: 0, b: task.axes.length > 1 ? 1 : 0, field: "action", which: "listed",
   trial: data.trial, chosen: null, trail: [], chart: null, values: [0, 1],
-  sort: ["usage", -1], all: false, coarse: 24,  // columns of the field while something moves
+  sort: ["usage", -1], all: false, pace: 0,  // ms that the last field took
 };
 
 function startPose() {
@@ -147,7 +147,7 @@ function say(words) {
 
 // ------------------------------------------------------------------------------------- showing
 
-let refining = 0, waiting = null;
+let waiting = null;
 
 // Decide at the pose; rules in the order of their shares.
 function look() {
@@ -171,15 +171,9 @@ function soon(what) {
 }
 
 // Show what changed: the pose always; the ground, the list of rules, the editor where asked for.
-function update({ ground = false, list = false, editor = false, fine = false } = {}) {
+function update({ ground = false, list = false, editor = false } = {}) {
   look();
-  if (ground) {
-    clearTimeout(refining);
-    const begun = performance.now();
-    drawGround(fine);
-    if (!fine && performance.now() - begun > 8) view.coarse = Math.max(8, Math.round(0.8 * view.coarse));
-    if (!fine) refining = setTimeout(() => drawGround(true), 120);
-  }
+  if (ground) drawGround();
   drawMap();
   showHere();
   if (editor) showEditor();
@@ -193,7 +187,7 @@ function layout() {
   inks.clear();
   const stage = document.querySelector(".stage"), h = mapHeight(stage.clientWidth);
   stage.style.height = $("ground").style.height = `${h}px`;
-  update({ ground: true, fine: true });
+  update({ ground: true });
   drawCurve();
   showLegend();
 }

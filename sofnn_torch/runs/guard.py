@@ -82,7 +82,7 @@ def diagnose(agent: Learner, observation: np.ndarray) -> str:
 def farthest(axis: Axis) -> float:
     """Where no centre on an axis makes sense any more."""
     ends = [abs(end) for end in (axis.low, axis.high) if math.isfinite(end)]
-    return max(FARTHEST, *(10 * end for end in ends))
+    return max([FARTHEST, *(10 * end for end in ends)])
 
 
 def physics_warnings(env: Any) -> str:
