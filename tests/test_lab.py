@@ -18,7 +18,7 @@ from sofnn_torch.learners.learner import Task
 from sofnn_torch.maze.layouts import assets
 from sofnn_torch.network.axes import named
 from sofnn_torch.network.sofnn import SOFNN
-from sofnn_torch.rules import lab
+from sofnn_torch.rules import lab, terms, words
 from sofnn_torch.runs import rule_files
 from sofnn_torch.runs.settings import Config
 
@@ -40,8 +40,7 @@ const found = states.map((x) => {
 def content(kind="three", **options):
     """Settings, learner and data of a page with rules by chance."""
     config, agent = learner(kind, **options)
-    shares = np.full(agent.net.n_rules, 1 / agent.net.n_rules)
-    return config, agent, lab.data(config, agent, shares, "chance", None, 0)
+    return config, agent, lab.data(config, agent, states(agent, 9), "chance", None, 0)
 
 
 def page(kind="three", **options):
@@ -101,12 +100,13 @@ def test_a_learner_that_does_not_say_how_it_decides_has_no_page():
     task = Task(named(2), ("left", "right"), discrete=True)
     agent = Sarsa(SOFNN(2, 2, width=0.2), task, SarsaConfig())
     with pytest.raises(ValueError, match="has no decoding"):
-        lab.data(Config(), agent, np.zeros(0), "own", None, 0)
+        lab.data(Config(), agent, np.zeros((1, 2), np.float32), "own", None, 0)
 
 
 def check_decisions(kind, agent, config, x, found):
     """Choices and actions of the page are those of the exported policy and of the learner."""
-    ours, plan = exported(config, agent), agent.plan(x)
+    ours = exported(config, agent)
+    plan = agent.plan(np.clip(x, ours.low, ours.high).astype(np.float32))  # as the task gives them
     close = margins(ours, x)
     if agent.choices:
         choices = np.array([choice for choice, *_ in found])
@@ -150,9 +150,11 @@ def test_the_policy_of_a_page_decides_as_the_learner(kind):
     const other = makePolicy(task, others), moved = states.slice(0, 12).map((x) => {
       const swapped = field(policy, x);
       swapRules(swapped, other, [...rules.keys()].filter((k) => k % 9 === 0));
-      return [readField(swapped), readField(field(other, x))].map((f) => [...f.leanings, ...f.values]);
+      const both = [readField(swapped), readField(field(other, x))];
+      return both.map((f) => [...f.leanings, ...f.values]);
     });
-    console.log(JSON.stringify({ found, told, sums, at, moved }));"""
+    console.log(JSON.stringify({ found, told, sums, at, moved,
+      places: rules.map(whereOf) }));"""
     program = "\n".join([*parts, known, rules, DECIDE, field])
     done = subprocess.run([NODE, "-"], input=program, capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stderr
@@ -164,6 +166,9 @@ def test_the_policy_of_a_page_decides_as_the_learner(kind):
     swapped, anew = np.array(answers["moved"]).transpose(1, 0, 2)
     np.testing.assert_allclose(swapped, anew, rtol=1e-5, atol=1e-5)
     assert all(text.endswith(".") and "NaN" not in text for text in answers["told"])
+    sentences = terms.sentences(agent, words.read(agent), lab.TERMS)
+    for ours, theirs in zip(answers["places"], sentences, strict=True):
+        assert theirs.lower().startswith(f"{ours}:")
 
 
 # ------------------------------------------------------------------------------- in a browser

@@ -75,6 +75,8 @@ def test_files_are_data():
 def test_the_wheel_holds_the_assets_and_its_types_and_no_tests(wheel):
     names = set(zipfile.ZipFile(wheel).namelist())
     assert {"sofnn_torch/assets/khepera_maze.xml", "sofnn_torch/py.typed"} <= names
+    pages = {f"sofnn_torch/assets/lab/{path.name}" for path in (ROOT / "assets/lab").iterdir()}
+    assert "sofnn_torch/assets/lab/lab.html" in pages and pages <= names
     assert not [name for name in names if name.startswith(("tests", "docs", "runs"))]
 
 

@@ -180,7 +180,7 @@ function connect() {
     const head = event.target.closest("button[data-sort]");
     if (!head) return pickRule(event);
     const name = head.dataset.sort, [old, way] = view.sort;
-    view.sort = [name, name === old ? -way : ["number", "born"].includes(name) || name.startsWith("in") ? 1 : -1];
+    view.sort = [name, name === old ? -way : ["number", "moment", "born"].includes(name) || name.startsWith("in") ? 1 : -1];
     showList();
     document.querySelector(`#rules button[data-sort="${name}"]`).focus();
   });

@@ -10,11 +10,12 @@ function fieldNow(a, b, us, vs, wanted) {
   const kept = drawn && drawn.a === a && drawn.b === b && drawn.wanted === wanted && drawn.policy.K === policy.K
     && String([drawn.us, drawn.vs]) === String([us, vs]) && String(drawn.columns) === String(usedColumns(policy, wanted));
   const changed = kept ? [...rules.keys()].filter((k) => rules[k] !== drawn.policy.rules[k]) : [];
-  const anew = !kept || changed.length > 5, moved = anew || hasMoved();
-  if (anew) drawn = makeField(policy, a, b, us, vs, wanted);
-  else if (changed.length && !moved) swapRules(drawn, policy, changed);
-  else if (changed.length) drawn = makeField(policy, a, b, us, vs, wanted);
-  if (moved) sumField(drawn, view.pose);
+  const moved = hasMoved();
+  if (!kept || changed.length > 5 || (changed.length && moved)) {
+    drawn = makeField(policy, a, b, us, vs, wanted);
+    sumField(drawn, view.pose);
+  } else if (changed.length) swapRules(drawn, policy, changed);
+  else if (moved) sumField(drawn, view.pose);
   return readField(drawn);
 }
 

@@ -10,7 +10,7 @@ const n = task.inputs.length;
 let rules = data.rules.map((row, k) => ({
   number: k + 1,
   centre: row.slice(0, n), width: row.slice(n, 2 * n), consequents: row.slice(2 * n),
-  usage: data.usage[k] ?? 0, born: data.born[k] ?? 0,
+  usage: data.usage[k] ?? 0, moment: data.moments[k] ?? 0, born: data.born[k] ?? 0,
 }));
 const first = rules, past = [], future = [];
 let policy = makePolicy(task, rules), decision = null;
@@ -117,7 +117,7 @@ function copyHere() {
   remember();
   const number = 1 + Math.max(...first.map((r) => r.number), ...rules.map((r) => r.number));
   const centre = rule.centre.map((v, i) => bounded(i, view.pose[i] ?? v));
-  put([...rules, { ...rule, number, centre, usage: 0, born: 0, edited: true }]);
+  put([...rules, { ...rule, number, centre, usage: 0, moment: 0, born: 0, edited: true }]);
   view.chosen = number;
   update({ ground: true, list: true, editor: true });
 }

@@ -81,7 +81,8 @@ function showEditor() {
     rule.edited ? "edited" : rule.born ? `made in trial ${rule.born}` : "",
     `${percent(rule.usage)} of the firing in the trial`, isOutvoted(rule) ? "outvoted at its centre" : "",
   ].filter(Boolean).join(" · ");
-  $("sentence").innerHTML = `If ${escaped(said.join(" and "))}, then ${swatch(leaning(policy, vote))}<b>${escaped(actionName(task, vote))}</b>.`;
+  const place = whereOf(rule);
+  $("sentence").innerHTML = `<b>${escaped(place[0].toUpperCase() + place.slice(1))}.</b> If ${escaped(said.join(" and "))}, then ${swatch(leaning(policy, vote))}<b>${escaped(actionName(task, vote))}</b>.`;
   if (form.contains(document.activeElement) && form.dataset.rule === String(rule.number)) {
     for (const input of form.querySelectorAll("input")) {
       const [part, i] = input.dataset.key.split("-"), scale = part === "consequents" ? 1 : shown(task.inputs[i]).scale;
@@ -108,7 +109,7 @@ function isSilent(j) {
 
 function sentence(rule) {
   const about = task.inputs.map((axis, i) => `${axis.name} ${aboutOn(axis, rule.centre[i], rule.width[i])}`);
-  return `${about.join(" ")} ${actionName(task, voteOf(rule))}`;
+  return `${whereOf(rule)} ${about.join(" ")} ${actionName(task, voteOf(rule))}`;
 }
 
 // Numbers (from 0) of the rules that the filters leave.
@@ -136,6 +137,7 @@ function columnsOf() {
   const columns = [
     ["number", "rule", (k) => rules[k].number, (k) => `<button>${rules[k].number}</button>`],
     ["usage", "used", (k) => rules[k].usage, (k) => percent(rules[k].usage)],
+    ["moment", "at decision", (k) => rules[k].moment || Infinity, (k) => rules[k].moment || ""],
     ["here", "here", (k) => decision.shares[k], (k) => (decision.shares[k] < 0.0005 ? "" : percent(decision.shares[k]))],
   ];
   task.inputs.forEach((axis, i) => {

@@ -43,6 +43,39 @@ function aboutOn(axis, centre, width) {
   return isBearing(axis) ? `${text}° ${wind(centre)}` : text;
 }
 
+// What a rule is about on an axis, in the terms of terms.py: a term, "A to B", or nothing if all.
+function termOf(terms, period, centre, width) {
+  const { names, low, high } = terms, step = (high - low) / names.length;
+  const away = names.map((_, j) => wrapped(low + step * (j + 0.5) - centre, period));
+  const about = away.map((d) => Math.abs(d) <= Math.sqrt(2 * Math.log(2)) * width);
+  if (about.every(Boolean)) return "";
+  about[away.reduce((best, d, j) => (Math.abs(d) < Math.abs(away[best]) ? j : best), 0)] = true;
+  const found = [...names.keys()].filter((j) => about[j]).sort((p, q) => away[p] - away[q]).map((j) => names[j]);
+  return found.length === 1 ? found[0] : `${found[0]} to ${found.at(-1)}`;
+}
+
+// Where a rule is, in words.
+function whereOf(rule) {
+  const said = task.axes.map((axis, i) => termOf(data.terms[i], axis.period, rule.centre[i], rule.width[i]));
+  const plane = data.maze ? [regionOf(said[0], said[1])] : [], rest = task.axes.map((axis, i) => said[i] && `${axis.name} ${said[i]}`);
+  return [...plane, ...rest.slice(2 * plane.length)].filter(Boolean).join(", ") || "anywhere";
+}
+
+// Terms from west to east and from south to north as one phrase.
+function regionOf(x, y) {
+  if (!x || !y || `${x}${y}`.includes(" to ")) {
+    const side = (term, line) => (term.includes(" to ") ? `from ${term}` : term === "middle" ? `in the middle ${line}` : term && `in the ${term}`);
+    return [side(y, "row"), side(x, "column")].filter(Boolean).join(", ");
+  }
+  if (x === "middle" || y === "middle") {
+    const other = y === "middle" ? x : y;
+    return other === "middle" ? "in the middle" : `in the middle of the ${other}`;
+  }
+  const split = (term) => [term.slice(0, term.lastIndexOf(" ") + 1), term.slice(term.lastIndexOf(" ") + 1)];
+  const [degree] = split(y), [same, east] = split(x);
+  return degree === same ? `in the ${y}-${east}` : `in the ${y} and ${x}`;
+}
+
 function percent(share) {
   return share >= 0.0995 ? `${Math.round(100 * share)} %` : `${fixed(100 * share, 1)} %`;
 }

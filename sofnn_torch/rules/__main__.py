@@ -7,6 +7,7 @@
     python -m sofnn_torch.rules RUN --check                # what is doubtful in them
     python -m sofnn_torch.rules RUN --within 0.1 0.2 0.1 0.2 60 120   # what it can do in a region
     python -m sofnn_torch.rules RUN --json rules.json --csv rules.csv --picture rules.png
+    python -m sofnn_torch.rules RUN --html lab.html        # a page to look, change and drive
     python -m sofnn_torch.rules RUN --load rules.json      # edited rules become a new run
     python -m sofnn_torch.rules RUN --reduce 40            # few rules that drive as well, a new run
     python -m sofnn_torch.rules --new rules.csv            # rules alone do: with flags of train.py
@@ -300,7 +301,7 @@ def run(options: Options) -> None:
         tables.show(tables.table(reading, shares, options.top))
     write(options, config, agent, reading, shares)
     if options.html:
-        lab.write(options.html, options.run, loaded, shares)
+        lab.write(options.html, options.run, loaded, trial.states)
     for file in files:
         print(f"written: {file}")
 

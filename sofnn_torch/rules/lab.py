@@ -18,6 +18,8 @@ from sofnn_torch.export import policy
 from sofnn_torch.learners.learner import Learner
 from sofnn_torch.maze.layouts import assets
 from sofnn_torch.pictures.figures import read_column
+from sofnn_torch.rules import played, terms
+from sofnn_torch.rules.tables import FIRED
 from sofnn_torch.runs import checkpoint, rule_files
 from sofnn_torch.runs.factory import make_plan
 from sofnn_torch.runs.session import home_of
@@ -25,17 +27,18 @@ from sofnn_torch.runs.settings import MAZE, Config
 from sofnn_torch.terminal import say
 
 LARGEST = 1_000_000  # bytes that a page should have
+TERMS = 5  # on an axis
 CURVES = ("steps", "reward", "success", "rules")  # columns of trials.csv
 
 
-def write(file: Path, source: Path, loaded: Loaded, shares: NDArray[Any]) -> None:
+def write(file: Path, source: Path, loaded: Loaded, states: NDArray[np.float32]) -> None:
     """Write the page of a run.
 
     Args:
         file: of the page.
         source: the run or checkpoint file that was named.
         loaded: what it holds.
-        shares: use of each rule along a trial. Shape: (K,).
+        states: of a trial, which says how rules are used. Shape: (T, n).
 
     Raises:
         ValueError: the learner does not say how its outputs become actions, or trials.csv cannot be
@@ -45,7 +48,7 @@ def write(file: Path, source: Path, loaded: Loaded, shares: NDArray[Any]) -> Non
     home = home_of(source)
     trials = home / "trials.csv" if home and (home / "trials.csv").exists() else None
     name = (home or source).resolve().name
-    page = filled(data(loaded.config, loaded.agent, shares, name, trials, loaded.state["trial"]))
+    page = filled(data(loaded.config, loaded.agent, states, name, trials, loaded.state["trial"]))
     checkpoint.write_atomically(file, page)
     if len(page) > LARGEST:
         say(f"warning: {file} has {len(page) / 1e6:.1f} MB, a browser may be slow with it")
@@ -74,7 +77,12 @@ def assembled() -> str:
 
 
 def data(
-    config: Config, agent: Learner, shares: NDArray[Any], name: str, trials: Path | None, trial: int
+    config: Config,
+    agent: Learner,
+    states: NDArray[np.float32],
+    name: str,
+    trials: Path | None,
+    trial: int,
 ) -> dict[str, Any]:
     """What the page knows, as plain data.
 
@@ -83,7 +91,7 @@ def data(
     Args:
         config: settings of the run.
         agent: its learner.
-        shares: use of each rule along a trial. Shape: (K,).
+        states: of a trial, which says how rules are used. Shape: (T, n).
         name: of the run.
         trials: its trials.csv, if there is one.
         trial: the last trial that the learner has seen.
@@ -104,6 +112,8 @@ def data(
         for axis in agent.inputs
     ]
     task |= {"inputs": inputs, "choices": list(agent.choices), "theta": agent.net.theta}
+    shares, when = agent.usage(states), played.moments(agent, states) + 1
+    part = shares * len(states) >= FIRED
     curves = history(trials, trial) if trials else {}
     return {
         "name": name,
@@ -116,6 +126,11 @@ def data(
         "counts": list(kind.counts),
         "rules": rule_files.shortest(agent.net.table().detach().T.numpy()).tolist(),
         "usage": [float(f"{share:.3g}") for share in shares.tolist()],
+        "moments": np.where(part, when, 0).tolist(),
+        "terms": [
+            {"names": found.names, "low": found.low, "high": found.high}
+            for found in terms.of_rules(agent, TERMS)
+        ],
         "curves": curves,
         "born": born(curves.get("rules", []), agent.net.n_rules),
     }
