@@ -58,7 +58,7 @@ function reach(part, i) {
 function field(part, i, name, unit, scale) {
   const rule = chosen(), [low, high] = reach(part, i), value = rule[part][i];
   const step = Number(((high - low) * scale / 400).toPrecision(1)), key = `${part}-${i}`;
-  const at = Number((value * scale).toPrecision(6));
+  const at = Number((value * scale).toPrecision(5));
   return `<label>${escaped(name)}<input type="range" data-key="${key}" aria-label="${escaped(name)}" min="${low * scale}" max="${high * scale}" step="any" value="${at}">
     <input type="number" data-key="${key}" aria-label="${escaped(name)} as a number" step="${step}" value="${at}"><small>${escaped(unit)}</small></label>`;
 }
@@ -86,7 +86,7 @@ function showEditor() {
   if (form.contains(document.activeElement) && form.dataset.rule === String(rule.number)) {
     for (const input of form.querySelectorAll("input")) {
       const [part, i] = input.dataset.key.split("-"), scale = part === "consequents" ? 1 : shown(task.inputs[i]).scale;
-      if (input !== document.activeElement) input.value = Number((rule[part][i] * scale).toPrecision(6));
+      if (input !== document.activeElement) input.value = Number((rule[part][i] * scale).toPrecision(5));
     }
     return;
   }
@@ -175,7 +175,7 @@ function showLegend() {
   const ends = task.discrete || task.decision.kind === "values" ? task.choices : null;
   const count = ends ? ends.length : 0, parts = [];
   if (view.field === "value") {
-    parts.push(`<span>pale to dark: value ${fixed(view.values[0])} to ${fixed(view.values[1])}</span>`);
+    parts.push(`<span>faint to full: value ${fixed(view.values[0])} to ${fixed(view.values[1])}</span>`);
   } else if (count && count <= 3) {
     ends.forEach((name, j) => parts.push(`<span>${swatch(count > 1 ? (2 * j) / (count - 1) - 1 : 0)}${escaped(name)}</span>`));
   } else {
