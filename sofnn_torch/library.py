@@ -136,7 +136,7 @@ class Agent:
                     if record.success is not None:
                         successes.append(record.success)
                     if curves:
-                        values = scalars(record, successes, speed)
+                        values = scalars(record, successes, speed, self.learner.name)
                         curves.add(Summary(value=values), record.trial)
                         curves.flush()
                     if callback is not None and callback(record) is False:

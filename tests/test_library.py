@@ -160,7 +160,7 @@ def test_curves_are_written_on_request(tmp_path):
     for _ in range(2):
         agent.learn(Toy(), trials=2, tensorboard=str(tmp_path / "curves"), quiet=True)
     curves = scalars(tmp_path / "curves")
-    assert curves["trial/return"] == [(1, 3.0), (2, 3.0), (3, 3.0), (4, 3.0)]
+    assert curves["1_result/return"] == [(1, 3.0), (2, 3.0), (3, 3.0), (4, 3.0)]
     assert curves["rules/count"][-1][1] == agent.learner.net.n_rules
 
 

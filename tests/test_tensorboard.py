@@ -2,7 +2,7 @@
 
 import io
 import re
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -24,6 +24,7 @@ from sofnn_torch.pictures.events import EventFile
 from sofnn_torch.pictures.film import film, gif
 from sofnn_torch.pictures.tensorboard import Monitor
 from sofnn_torch.runs import seeding
+from sofnn_torch.runs.directory import flatten
 from sofnn_torch.runs.factory import make_agent, make_env
 from sofnn_torch.runs.settings import Config
 from sofnn_torch.runs.trial import Trajectory
@@ -67,6 +68,12 @@ def scalar(accumulator, name):
     return {event.step: event.value for event in accumulator.Scalars(name)}
 
 
+def changed(config):
+    """Settings that are not those of the preset, by dotted names."""
+    ours, usual = (flatten(asdict(c)) for c in (config, Config(agent=config.agent)))
+    return {name for name in ours if ours[name] != usual[name]}
+
+
 def numbered(record, trial, **changes):
     return replace(record, trial=trial, **changes)
 
@@ -78,15 +85,22 @@ def test_every_scalar_is_documented_and_has_its_value(tmp_path, played):
     monitor.close()
     found = events(tmp_path)
     names = {tag for tag in found.Tags()["scalars"]}
-    documented = set(re.findall(r"`([a-z]+/[a-z_0-9]+)`", METRICS.read_text()))
+    documented = set(re.findall(r"`([a-z_0-9]+/[a-z_0-9]+)`", METRICS.read_text()))
     assert names <= documented
-    assert {"trial/steps", "rules/count", "pose/error_mean", "learning/error_rms"} <= names
-    assert scalar(found, "trial/steps") == {1: record.steps}
+    assert {
+        "1_result/steps",
+        "rules/count",
+        "pose/error_mean",
+        "learning/error_rms_sga",
+    } <= names or config.agent == "q"
+    assert scalar(found, "1_result/steps") == {1: record.steps}
     assert scalar(found, "rules/count") == {1: record.rules}
     assert scalar(found, "speed/steps_per_second") == {1: 1234.5}
     assert scalar(found, "pose/error_mean")[1] == pytest.approx(record.measures["pose_error"])
     for name, value in record.statistics.items():
-        assert scalar(found, name)[1] == pytest.approx(value)
+        own = f"_{config.agent}" * (name == "learning/error_rms")
+        assert scalar(found, name + own)[1] == pytest.approx(value)
+    assert min(names) == "1_result/return"  # the group that TensorBoard shows first
 
 
 def test_settings_are_hparams_of_the_same_run(tmp_path, sga_trial):
@@ -98,8 +112,11 @@ def test_settings_are_hparams_of_the_same_run(tmp_path, sga_trial):
     content = events(tmp_path).summary_metadata["_hparams_/session_start_info"]
     hparams = HParamsPluginData.FromString(content.plugin_data.content).session_start_info.hparams
     assert hparams["seed"].number_value == 42
-    assert hparams["net.theta"].number_value == pytest.approx(config.net.theta)
     assert hparams["agent"].string_value == "sga"
+    assert set(hparams) == {*"env agent network pose preset seed".split(), *changed(config)}
+    (settings,) = events(tmp_path).Tensors("settings/text_summary")
+    said = settings.tensor_proto.string_val[0].decode()
+    assert f"    net.theta = {config.net.theta}\n" in said and "    seed = 42\n" in said
 
 
 def test_resume_hides_what_the_interrupted_run_wrote_after_its_checkpoint(tmp_path, sga_trial):
@@ -111,10 +128,10 @@ def test_resume_hides_what_the_interrupted_run_wrote_after_its_checkpoint(tmp_pa
     second = Monitor(tmp_path, config, first_trial=2, picture_every=0)
     second.trial(numbered(record, 2, steps=20), path, agent, 1.0)
     second.close()
-    assert scalar(events(tmp_path), "trial/steps") == {1: 1, 2: 20}
+    assert scalar(events(tmp_path), "1_result/steps") == {1: 1, 2: 20}
     shown = plugin_event_accumulator.EventAccumulator(str(tmp_path))  # what TensorBoard reads with
     shown.Reload()
-    assert [event.step for event in shown.Tensors("trial/steps")] == [1, 2]
+    assert [event.step for event in shown.Tensors("1_result/steps")] == [1, 2]
 
 
 def test_moving_success_rate_goes_on_after_a_resume(tmp_path, sga_trial):
@@ -126,7 +143,7 @@ def test_moving_success_rate_goes_on_after_a_resume(tmp_path, sga_trial):
         monitor.trial(numbered(record, trial, success=False), path, agent, 1.0)
     monitor.close()
     # Trials 2..11: 7, 8, 9 and 10 reached the goal; 3..12 the same.
-    assert scalar(events(tmp_path), "trial/success_last_10") == pytest.approx({11: 0.4, 12: 0.4})
+    assert scalar(events(tmp_path), "1_result/success_last_10") == pytest.approx({11: 0.4, 12: 0.4})
 
 
 def test_pictures_come_when_due_and_leave_the_learner_alone(tmp_path, played):
@@ -142,7 +159,7 @@ def test_pictures_come_when_due_and_leave_the_learner_alone(tmp_path, played):
     for name in names:
         (image,) = found.Images(f"pictures/{name}")
         assert image.step == 2
-        assert (image.width, image.height) == (500, 500)
+        assert (image.width, image.height) == (800, 800)
         assert image.encoded_image_string.startswith(b"\x89PNG")
     rng, table, usage = before
     assert agent.state_dict()["rng"] == rng
@@ -183,7 +200,7 @@ def test_a_full_disk_costs_one_warning_and_what_it_refused(
     (warning,) = capsys.readouterr().err.strip().splitlines()
     assert "no TensorBoard" in warning
     assert "No space left" in warning
-    assert list(scalar(events(tmp_path), "trial/steps")) == [1, 4]
+    assert list(scalar(events(tmp_path), "1_result/steps")) == [1, 4]
 
 
 def test_no_rendering_costs_one_warning_and_the_video(tmp_path, sga_trial, capsys, monkeypatch):
@@ -200,7 +217,7 @@ def test_no_rendering_costs_one_warning_and_the_video(tmp_path, sga_trial, capsy
     (warning,) = capsys.readouterr().err.strip().splitlines()
     assert "no video" in warning
     assert "install EGL" in warning
-    assert list(scalar(events(tmp_path), "trial/steps")) == [1, 2]
+    assert list(scalar(events(tmp_path), "1_result/steps")) == [1, 2]
 
 
 def test_a_deleted_event_file_is_made_anew(tmp_path, sga_trial):
@@ -212,7 +229,7 @@ def test_a_deleted_event_file_is_made_anew(tmp_path, sga_trial):
         file.unlink()
     monitor.trial(numbered(record, 2), path, agent, 1.0)
     monitor.close()
-    assert list(scalar(events(tmp_path), "trial/steps")) == [2]
+    assert list(scalar(events(tmp_path), "1_result/steps")) == [2]
 
 
 class Camera:

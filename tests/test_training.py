@@ -141,7 +141,7 @@ def test_the_table_holds_every_trial_to_the_last_bit(options):
 
 def test_table_and_curves_agree(options):
     run = training.train(settings(trials=3), options)
-    curve = scalars(run)["trial/steps"]
+    curve = scalars(run)["1_result/steps"]
     assert curve == [(int(row["trial"]), float(row["steps"])) for row in rows_of(run)]
 
 

@@ -19,7 +19,7 @@ from matplotlib.axes import Axes
 from numpy.typing import NDArray
 from PIL import Image
 from tensorboard.compat.proto.summary_pb2 import Summary
-from torch.utils.tensorboard.summary import hparams
+from torch.utils.tensorboard.summary import hparams, text
 
 from sofnn_torch.learners.learner import Learner
 from sofnn_torch.maze.plan import MazePlan
@@ -28,13 +28,17 @@ from sofnn_torch.pictures.events import EventFile
 from sofnn_torch.pictures.film import film, gif
 from sofnn_torch.runs.directory import flatten
 from sofnn_torch.runs.factory import make_plan
+from sofnn_torch.runs.preset_files import differences
 from sofnn_torch.runs.settings import MAZE, Config
 from sofnn_torch.runs.trial import Trajectory, TrialRecord
 from sofnn_torch.terminal import say
 
 WINDOW = 10  # trials in the moving success rate
 VIDEO_STEPS = 1000  # a robot that does not find the goal is not filmed for ever
-HPARAM_METRICS = ("trial/steps", "trial/success_last_10", "trial/return", "rules/count")
+FIRST = "1_result"  # groups stand in the order of their names: what one wants to see first
+HPARAM_METRICS = (f"{FIRST}/steps", f"{FIRST}/success_last_10", f"{FIRST}/return", "rules/count")
+ALWAYS = ("env", "agent", "network", "pose", "preset", "seed")  # settings that tell runs apart
+DPI = 160  # of pictures of 5 inches
 TAGS = {
     "pose_error": "pose/error_mean",
     "pose_error_max": "pose/error_max",
@@ -43,7 +47,10 @@ TAGS = {
 
 
 def scalars(
-    record: TrialRecord, successes: Collection[float], steps_per_second: float
+    record: TrialRecord,
+    successes: Collection[float],
+    steps_per_second: float,
+    learner: str,
 ) -> list[Summary.Value]:
     """The curves' values after a trial.
 
@@ -51,20 +58,23 @@ def scalars(
         record: the trial.
         successes: whether each of the last trials was one; of a task that says so.
         steps_per_second: simulator steps over wall-clock time of the trial.
+        learner: its name, in that of its errors: those of two learners have scales of their own.
     """
     values: dict[str, float] = {
-        "trial/steps": record.steps,
+        f"{FIRST}/steps": record.steps,
+        f"{FIRST}/return": record.reward,
         "trial/decisions": record.decisions,
-        "trial/return": record.reward,
         "trial/total_steps": record.total_steps,
         "rules/count": record.rules,
         "speed/steps_per_second": steps_per_second,
     }
     if record.success is not None:
         values["trial/success"] = float(record.success)
-        values["trial/success_last_10"] = sum(successes) / len(successes)
+        values[f"{FIRST}/success_last_10"] = sum(successes) / len(successes)
     values |= {TAGS.get(k, f"trial/{k}"): v for k, v in record.measures.items()}
-    return [Summary.Value(tag=k, simple_value=v) for k, v in (values | record.statistics).items()]
+    own = {"learning/error_rms": f"learning/error_rms_{learner}"}
+    values |= {own.get(k, k): v for k, v in record.statistics.items()}
+    return [Summary.Value(tag=k, simple_value=v) for k, v in values.items()]
 
 
 class Monitor:
@@ -72,7 +82,8 @@ class Monitor:
 
     Args:
         run_dir: directory of the run.
-        config: settings of the run, shown under HPARAMS.
+        config: settings of the run: all of them under TEXT, those that change a preset or tell runs
+            apart under HPARAMS.
         first_trial: the trial that comes next; what an interrupted run wrote from there on is
             hidden, and successes before it are read from ``trials.csv``.
         picture_every: trials between two sets of pictures, 0 for none.
@@ -146,12 +157,16 @@ class Monitor:
 
     def _open(self, trial: int) -> EventFile:
         self._events = events = EventFile(self.run_dir, trial)
-        self._hparams(events)
+        self._settings(events)
         return events
 
-    def _hparams(self, events: EventFile) -> None:
+    def _settings(self, events: EventFile) -> None:
         """Write the settings into this run; torch's `add_hparams` would make a second."""
-        settings = flatten(dataclasses.asdict(self.config))
+        everything = flatten(dataclasses.asdict(self.config))
+        lines = "".join(f"    {name} = {value}\n" for name, value in everything.items())
+        events.add(text("settings", lines))
+        shown = dict.fromkeys([*ALWAYS, *differences(self.config)])
+        settings = {name: everything[name] for name in shown if name in everything}
         plain = {
             name: value if isinstance(value, bool | int | float | str) else str(value)
             for name, value in settings.items()
@@ -163,7 +178,8 @@ class Monitor:
         events = self._events
         if events is None or not events.path.exists():  # the disk failed, or deleted
             events = self._open(record.trial)
-        values = scalars(record, self.successes, steps_per_second)
+        name = self.config.learner.name
+        values = scalars(record, self.successes, steps_per_second, name)
         events.add(Summary(value=values), record.trial)
         events.flush()
 
@@ -184,7 +200,7 @@ class Monitor:
         for name, draw in drawings.items():
             figure, (ax,) = figures.canvas(width=5, height=5, tight=False)
             draw(ax)
-            self._image(f"pictures/{name}", figures.png(figure, dpi=100), trial)
+            self._image(f"pictures/{name}", figures.png(figure, dpi=DPI), trial)
         gc.collect()  # figures refer to themselves: 200 MiB would wait for the next full collection
 
     def _video(self, trial: int, agent: Learner) -> None:
