@@ -128,7 +128,7 @@ def test_a_run_is_trained_and_evaluated_and_then_kept(tmp_path, monkeypatch):
     monkeypatch.setattr(training, "train", None)
     monkeypatch.setattr(training, "resume", None)
     assert done(work) == 0
-    assert running.find_runs(tmp_path) == {essence(work.config): work.path}
+    assert running.find_runs(tmp_path) == ({essence(work.config): work.path}, set())
     (found,) = running.plan(tmp_path, ["section5"], "sga-sofnn-est", [0], TINY)
     assert found == dataclasses.replace(work, conditions=False) and found.done()
 

@@ -14,7 +14,7 @@ import numpy as np
 from sofnn_torch.pictures.figures import read_column
 from sofnn_torch.runs.settings import Config
 from sofnn_torch.studies.results import write_table
-from sofnn_torch.studies.running import EPISODES, PLAYED, find_runs
+from sofnn_torch.studies.running import EPISODES, PLAYED, find_runs, sittings
 from sofnn_torch.studies.studies import STUDIES, changed, essence, settings
 
 IN_A_ROW, WITHIN = 10, 1.5  # learned: so many trials in a row under so many times the optimum
@@ -46,7 +46,7 @@ def collect(
     parts = ("", "curves", "paths", "conditions")
     tables: dict[str, list[dict[str, Any]]] = {part: [] for part in parts}
     of_arm: dict[Config, list[tuple[int, Path]]] = {}
-    for config, path in find_runs(parent, any_code).items():
+    for config, path in find_runs(parent, any_code)[0].items():
         if (path / "evaluation.json").exists():
             anonymous = dataclasses.replace(config, seed=0)
             of_arm.setdefault(anonymous, []).append((config.seed, path))
@@ -56,7 +56,7 @@ def collect(
         found = sorted(of_arm.get(essence(config), []))
         if not found:
             continue
-        made = [source for _, path in found for source in _sources(path)]
+        made = [source for _, path in found for source in sittings(path)]
         arms[arm] = {
             "changes": changed(entries),
             "commits": _distinct(source["commit"] for source in made),
@@ -102,12 +102,6 @@ def collect(
         "arms": arms,
     }
     file.write_text(json.dumps(summary, indent=1) + "\n")
-
-
-def _sources(path: Path) -> list[dict[str, Any]]:
-    """Versions and commits of a run, of all its sittings."""
-    source = json.loads((path / "config.json").read_text())
-    return [source, *source.get("earlier", [])]
 
 
 def _row(path: Path, config: Config, optimum: int) -> dict[str, Any]:

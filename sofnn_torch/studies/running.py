@@ -44,28 +44,33 @@ class Job:
         return _is_evaluated(self.path) and others
 
 
-def find_runs(parent: Path, any_code: bool = False) -> dict[Config, Path]:
+def find_runs(parent: Path, any_code: bool = False) -> tuple[dict[Config, Path], set[Config]]:
     """The runs in a directory by what determines them; of equal ones the finished.
 
     Args:
         parent: the directory.
         any_code: take also runs of code that learns or plays in another way.
+
+    Returns:
+        the runs, and what determines those that are there of other code alone.
     """
     found: dict[Config, Path] = {}
+    others = set()
     for file in sorted(parent.glob("*/config.json")):
         with contextlib.suppress(ValueError):  # written by a version with other settings
             key = essence(directory.load_config(file.parent))
-            if not (any_code or codes(file.parent) == {code()}):
+            if not any_code and {part.get("code") for part in sittings(file.parent)} != {code()}:
+                others.add(key)
                 continue
             if key not in found or not (found[key] / "evaluation.json").exists():
                 found[key] = file.parent
-    return found
+    return found, others - found.keys()
 
 
-def codes(run: Path) -> set[str | None]:
-    """Fingerprints of the code that a run was trained with; None for one that was not kept."""
-    source = json.loads((run / "config.json").read_bytes())
-    return {part.get("code") for part in (source, *source.get("earlier", []))}
+def sittings(run: Path) -> list[dict[str, Any]]:
+    """Versions, commit and code of all sittings of a run; without what was not kept."""
+    last = json.loads((run / "config.json").read_bytes())
+    return [last, *last.get("earlier", [])]
 
 
 def plan(
@@ -86,9 +91,11 @@ def plan(
         changes: settings that are changed in every arm.
         any_code: take also runs of code that learns or plays in another way.
     """
-    existing = find_runs(parent, any_code)
-    if others := len(find_runs(parent, any_code=True)) - len(existing):
-        say(f"{others} runs below {parent} are of other code and left alone; --any-code takes them")
+    existing, others = find_runs(parent, any_code)
+    if others:
+        say(
+            f"{len(others)} runs below {parent} are of other code and left alone; --any-code takes them"
+        )
     planned: dict[Config, Job] = {}
     for name in studies:
         study, taken = STUDIES[name], {job.path for job in planned.values()}
