@@ -8,9 +8,10 @@ from pathlib import Path
 
 import pytest
 import torch
+from conftest import quick_options, settings
 
 from sofnn_torch import training
-from sofnn_torch.runs import directory, provenance
+from sofnn_torch.runs import provenance
 from sofnn_torch.studies import running
 
 ROOT = Path(__file__).parents[1]
@@ -96,7 +97,7 @@ def test_a_run_that_goes_on_elsewhere_says_so_in_one_line(quick, options, monkey
     del recorded["versions"]["blas"]  # as in runs of earlier versions
     (path / "config.json").write_text(json.dumps(recorded))
     here = recorded["versions"] | {"blas": "B", "instructions": "AVX7", "processor": "P"}
-    monkeypatch.setattr(directory, "versions", lambda: here)
+    monkeypatch.setattr(provenance, "versions", lambda: here)
     training.resume(path, options, trials=2)
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("warning: ") and line.endswith(": numbers may differ in the last bits")
@@ -141,3 +142,14 @@ def test_the_fingerprint_is_of_what_decides_and_of_the_mazes(monkeypatch):
     for name in ("maze/viewer.py", "plot.py", "studies/report.py"):
         assert (package / name).read_text() not in seen
     provenance.code.cache_clear()
+
+
+def test_a_run_whose_versions_are_lost_goes_on(tmp_path):
+    config = settings(trials=1)
+    run = training.train(config, quick_options(tmp_path, name="run"))
+    file = run / "config.json"
+    kept = json.loads(file.read_text())
+    del kept["versions"]
+    file.write_text(json.dumps(kept))
+    training.resume(run, quick_options(tmp_path), trials=2)
+    assert json.loads(file.read_text())["versions"]["torch"] == torch.__version__

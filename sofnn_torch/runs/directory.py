@@ -24,7 +24,7 @@ from sofnn_torch.progress import say
 from sofnn_torch.runs import checkpoint, table
 from sofnn_torch.runs.checkpoint import CheckpointError
 from sofnn_torch.runs.places import UNNAMED, alone, first_free
-from sofnn_torch.runs.provenance import code, commit, versions
+from sofnn_torch.runs.provenance import record
 from sofnn_torch.runs.settings import Config, from_dict
 from sofnn_torch.terminal import quoted
 
@@ -262,31 +262,27 @@ class Run:
         """Keep the versions of the session before; say so where results may differ."""
         try:
             before = json.loads((self.path / "config.json").read_bytes())
-            former = {name: before.get(name) for name in ("versions", "commit", "code")}
+            former = {"versions": before["versions"], "commit": before["commit"]}
+            former["code"] = before.get("code")  # older runs have none
         except (OSError, ValueError, KeyError, TypeError):
             return
         self.earlier = before.get("earlier", [])
-        if former == {"versions": versions(), "commit": commit(), "code": code()}:
+        now = record()
+        if former == now:
             return
         self.earlier.append(former)
         then = former["versions"]
         others = [
-            f"{name} was {then.get(name, 'unknown')}, is {now}"
-            for name, now in versions().items()
-            if then.get(name) != now
+            f"{name} was {then.get(name, 'unknown')}, is {version}"
+            for name, version in now["versions"].items()
+            if then.get(name) != version
         ]
         if others:
             say(f"warning: {'; '.join(others)}: numbers may differ in the last bits")
 
     def _write_settings(self) -> None:
         text = json.dumps(
-            {
-                "config": dataclasses.asdict(self.config),
-                "versions": versions(),
-                "commit": commit(),
-                "code": code(),
-                "earlier": self.earlier,
-            },
+            {"config": dataclasses.asdict(self.config), **record(), "earlier": self.earlier},
             indent=2,
         )
         checkpoint.write_atomically(self.path / "config.json", f"{text}\n".encode())

@@ -9,6 +9,7 @@ import platform
 import re
 import subprocess
 from pathlib import Path
+from typing import Any
 
 import gymnasium
 import mujoco
@@ -92,6 +93,11 @@ def commit() -> str | None:
         if answer.returncode == 0 and (here.parent / "pyproject.toml").exists():
             return answer.stdout.strip()
     return None
+
+
+def record() -> dict[str, Any]:
+    """What config.json holds of all that makes a result."""
+    return {"versions": versions(), "commit": commit(), "code": code()}
 
 
 @functools.cache

@@ -93,9 +93,8 @@ def plan(
     """
     existing, others = find_runs(parent, any_code)
     if others:
-        say(
-            f"{len(others)} runs below {parent} are of other code and left alone; --any-code takes them"
-        )
+        many = f"{len(others)} runs below {parent}"
+        say(f"{many} are of other code and left alone; --any-code takes them")
     planned: dict[Config, Job] = {}
     for name in studies:
         study, taken = STUDIES[name], {job.path for job in planned.values()}
