@@ -209,9 +209,19 @@ def mean(values: Sequence[float], seed: int = 0) -> Estimate:
 
 
 def proportion(successes: int, trials: int) -> Estimate:
-    """Share of successes with its exact interval (Clopper and Pearson 1934)."""
-    interval = stats.binomtest(successes, trials).proportion_ci(CONFIDENCE, method="exact")
-    return Estimate(successes / trials, float(interval.low), float(interval.high))
+    """Share of successes with its exact interval."""
+    return Estimate(successes / trials, *exact_interval(successes, trials, CONFIDENCE))
+
+
+def exact_interval(successes: float, count: float, level: float) -> tuple[float, float]:
+    """Interval of a share at a level of confidence (Clopper and Pearson 1934).
+
+    Numbers may be fractions, as of trials that tell less than as many independent ones.
+    """
+    tail, failures = 0.5 - 0.5 * level, count - successes
+    low = stats.beta.ppf(tail, successes, failures + 1.0) if successes else 0.0
+    high = stats.beta.ppf(1.0 - tail, successes + 1.0, failures) if failures else 1.0
+    return float(low), float(high)
 
 
 def summarise(records: Sequence[TrialRecord], optimum: float | None = None) -> dict[str, Estimate]:

@@ -1,5 +1,6 @@
 """Numbers over seeds: their intervals, and verdicts that are corrected for how many there are."""
 
+import functools
 import math
 import warnings
 from collections.abc import Callable, Sequence
@@ -10,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from sofnn_torch.evaluate import CONFIDENCE
+from sofnn_torch.evaluate import CONFIDENCE, exact_interval
 
 FEWEST = 5  # seeds: of fewer no interval keeps what it promises
 HOLDS, FAILS, OPEN = "holds", "does not hold", "cannot tell"
@@ -98,17 +99,10 @@ def ratio(above: NDArray[Any], below: NDArray[Any]) -> Measured:
 
 
 def proportion(successes: float, count: float) -> Measured:
-    """Share of successes with its exact interval (Clopper and Pearson 1934)."""
+    """Share of successes with its exact interval."""
     if not count:
         return Measured(math.nan)
-
-    def at(level: float) -> tuple[float, float]:
-        tail, failures = 0.5 - 0.5 * level, count - successes
-        low = stats.beta.ppf(tail, successes, failures + 1.0) if successes else 0.0
-        high = stats.beta.ppf(1.0 - tail, successes + 1.0, failures) if failures else 1.0
-        return float(low), float(high)
-
-    return Measured(successes / count, at)
+    return Measured(successes / count, functools.partial(exact_interval, successes, count))
 
 
 def share(successes: NDArray[Any], trials: int) -> Measured:
