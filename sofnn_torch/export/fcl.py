@@ -12,7 +12,6 @@ from typing import Any
 from sofnn_torch.export.sugeno import (
     Sugeno,
     assembled,
-    identifiers,
     numbers,
     read_with,
     span,
@@ -39,7 +38,7 @@ def to_fcl(data: dict[str, Any], *_options: Any) -> bytes:
     base = system(data)
     sets, terms, rules = vocabulary(base)
     n = len(base.inputs)
-    names = identifiers([*(ends[0] for ends in base.inputs), *base.outputs])
+    names = base.names
     lines = ["FUNCTION_BLOCK policy", "", "VAR_INPUT", *(f"  {name}: REAL;" for name in names[:n])]
     lines += ["END_VAR", "", "VAR_OUTPUT", *(f"  {name}: REAL;" for name in names[n:]), "END_VAR"]
     for name, (_, low, high), found in zip(names, base.inputs, sets, strict=False):

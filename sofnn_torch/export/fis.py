@@ -7,7 +7,6 @@ from typing import Any
 from sofnn_torch.export.sugeno import (
     Sugeno,
     assembled,
-    identifiers,
     numbers,
     read_with,
     span,
@@ -28,7 +27,7 @@ def to_fis(data: dict[str, Any], *_options: Any) -> bytes:
     lines += [f"NumInputs={len(base.inputs)}", f"NumOutputs={len(base.outputs)}"]
     lines += [f"NumRules={len(rules)}", "AndMethod='prod'", "OrMethod='probor'"]
     lines += ["ImpMethod='prod'", "AggMethod='sum'", "DefuzzMethod='wtaver'"]
-    names = identifiers([*(ends[0] for ends in base.inputs), *base.outputs])
+    names = base.names
     n = len(base.inputs)
     for i, (_, low, high) in enumerate(base.inputs):
         lines += _variable(f"Input{i + 1}", names[i], low, high, "gaussmf", sets[i])

@@ -13,7 +13,6 @@ import numpy as np
 from sofnn_torch.export.sugeno import (
     Sugeno,
     assembled,
-    identifiers,
     numbers,
     read_with,
     system,
@@ -28,7 +27,7 @@ def to_fml(data: dict[str, Any], *_options: Any) -> bytes:
     base = system(data)
     sets, terms, rules = vocabulary(base)
     n = len(base.inputs)
-    names = identifiers([*(ends[0] for ends in base.inputs), *base.outputs])
+    names = base.names
     root = xml.Element("fuzzySystem", xmlns=SPACE, name="sofnn.policy")
     knowledge = xml.SubElement(root, "knowledgeBase")
     for name, (_, low, high), found in zip(names, base.inputs, sets, strict=False):

@@ -2,6 +2,7 @@
 
 import json
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from sofnn_torch.export import runtime
 from sofnn_torch.learners.frozen import MOST, nearness
 from sofnn_torch.learners.learner import Learner
 from sofnn_torch.maze.odometry import FORWARD_SPEED, STEP_SECONDS, TURN_SPEED, WHEEL_BASE
+from sofnn_torch.network.axes import Axis
 from sofnn_torch.runs.factory import make_plan, make_task
 from sofnn_torch.runs.rule_files import shortest
 from sofnn_torch.runs.settings import MAZE, Config
@@ -32,16 +34,7 @@ def describe(config: Config, agent: Learner) -> dict[str, Any]:
         "task": config.env,
         "learner": agent.name,
         "precision": str(agent.net.default_width.dtype).removeprefix("torch."),
-        "axes": [
-            {
-                "name": axis.name,
-                "unit": axis.unit,
-                "low": axis.low if math.isfinite(axis.low) else None,
-                "high": axis.high if math.isfinite(axis.high) else None,
-                "period": axis.period,
-            }
-            for axis in task.axes
-        ],
+        "axes": plain_axes(task.axes),
         "clipped": not maze,
         "actions": list(task.actions),
         "discrete": task.discrete,
@@ -64,6 +57,20 @@ def describe(config: Config, agent: Learner) -> dict[str, Any]:
     parts = (table[:, :n].tolist(), table[:, n : 2 * n].tolist(), table[:, 2 * n :].tolist())
     data["rules"] = [dict(zip(runtime.PARTS, row, strict=True)) for row in zip(*parts, strict=True)]
     return data
+
+
+def plain_axes(axes: Sequence[Axis]) -> list[dict[str, Any]]:
+    """Axes for JSON, which knows no infinity: None where there is no end."""
+    return [
+        {
+            "name": axis.name,
+            "unit": axis.unit,
+            "low": axis.low if math.isfinite(axis.low) else None,
+            "high": axis.high if math.isfinite(axis.high) else None,
+            "period": axis.period,
+        }
+        for axis in axes
+    ]
 
 
 def to_json(data: dict[str, Any]) -> bytes:

@@ -42,6 +42,11 @@ class Sugeno:
     widths: NDArray[np.float64]
     slopes: NDArray[np.float64]
 
+    @property
+    def names(self) -> list[str]:
+        """Names of the inputs and outputs in a file."""
+        return identifiers([*(name for name, _, _ in self.inputs), *self.outputs])
+
     def outputs_at(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """What such a tool computes at inputs (B, n). Shape: (B, m)."""
         firing = np.exp(-0.5 * (((x[:, None] - self.centres) / self.widths) ** 2).sum(2))

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 
-from sofnn_torch.maze.odometry import ROBOT_RADIUS
+from sofnn_torch.maze.odometry import ROBOT_RADIUS, wrap_angle
 
 INFRARED: dict[str, tuple[float, float, float]] = {  # x, y [m], direction [degrees]; x is ahead
     "ir_left_90": (0.0095, 0.023, 90.0),
@@ -65,7 +65,7 @@ def felt_walls(seen: Sequence[float], forward: float = 1.0) -> list[float]:
 
 def apart(first: float, second: float) -> float:
     """Return the angle between two directions [rad, 0 to pi]."""
-    return abs((first - second + math.pi) % (2.0 * math.pi) - math.pi)
+    return abs(wrap_angle(first - second))
 
 
 def _wall(first: int, second: int, seen: Sequence[float]) -> tuple[float, float]:

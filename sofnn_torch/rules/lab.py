@@ -5,7 +5,6 @@ maze and the trials as data. Its policy follows the equations of ``export/runtim
 """
 
 import json
-import math
 import re
 from pathlib import Path
 from typing import Any
@@ -101,17 +100,8 @@ def data(
     """
     kind, task = rule_files.schema(agent), policy.describe(config, agent)
     del task["rules"]
-    inputs = [
-        {
-            "name": axis.name,
-            "unit": axis.unit,
-            "low": axis.low if math.isfinite(axis.low) else None,
-            "high": axis.high if math.isfinite(axis.high) else None,
-            "period": axis.period,
-        }
-        for axis in agent.inputs
-    ]
-    task |= {"inputs": inputs, "choices": list(agent.choices), "theta": agent.net.theta}
+    task |= {"inputs": policy.plain_axes(agent.inputs), "choices": list(agent.choices)}
+    task["theta"] = agent.net.theta
     shares, when = agent.usage(states), played.moments(agent, states) + 1
     part = shares * len(states) >= FIRED
     curves = history(trials, trial) if trials else {}
