@@ -1,5 +1,6 @@
 """Shared fixtures: runs of a second or less, and what two runs must have in common."""
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from sofnn_torch import evaluate, training
 from sofnn_torch.rules import __main__ as rules
 from sofnn_torch.runs import checkpoint, rule_files
 from sofnn_torch.runs.settings import Config
+from sofnn_torch.studies.statistics import Measured
 from sofnn_torch.training import RunOptions
 
 torch.set_num_threads(1)
@@ -128,3 +130,8 @@ def assert_same_run(ours: Path, theirs: Path) -> None:
 def same_run():
     """Asserts that two run directories hold the same run."""
     return assert_same_run
+
+
+def fixed_interval(value, low=math.nan, high=math.nan):
+    """A number over seeds whose interval is the same at every level."""
+    return Measured(value, lambda level: (low, high))

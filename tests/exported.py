@@ -8,7 +8,8 @@ import pytest
 import torch
 from gymnasium.spaces import Box, Discrete
 
-from sofnn_torch.runs.factory import make_agent
+from sofnn_torch.export import runtime
+from sofnn_torch.runs.factory import make_agent, make_env
 from sofnn_torch.runs.settings import Config
 
 
@@ -108,3 +109,21 @@ def states(agent, count, seed=1):
     low, high = (np.array([getattr(axis, end) for axis in axes]) for end in ("low", "high"))
     margin = 0.1 * (high - low)
     return rng.uniform(low - margin, high + margin, (count, len(low))).astype(np.float32)
+
+
+def turns_north(path):
+    """The policy in a file, which has the three rules of another tool and drives by them."""
+    ours, (config, _) = runtime.read(path), learner("three", steps=400)
+    weights = np.exp(-0.5 * ((np.array([0.0, 1.5708]) - 0.2) / 0.5) ** 2)
+    west = np.exp(-0.5 * (0.9 / 0.2) ** 2) * weights[1]
+    expected = weights[0] / (weights.sum() + west)
+    assert ours.outputs([0.9, 0.5, 0.2])[0] == pytest.approx(expected, abs=1e-5)
+    env = make_env(config)
+    x, info = env.reset(seed=0, options={"pose": (0.15, 0.15, 0.0)})
+    action = ours.start(x)
+    for _ in range(6):
+        x, _, _, _, info = env.step(action)
+        action = ours.act(x)
+    env.close()
+    assert info["true_pose"][2] > 0.9  # it turned to the north
+    return ours

@@ -6,11 +6,10 @@ import subprocess
 
 import numpy as np
 import pytest
-from exported import ALL, learner, states
+from exported import ALL, learner, states, turns_north
 from test_export import command  # noqa: F401
 
 from sofnn_torch.export import fis, policy, runtime, sugeno
-from sofnn_torch.runs.factory import make_env
 
 OTHER = """% rules by hand: turn towards north, go straight there
 [System]
@@ -103,21 +102,9 @@ def test_rules_of_another_tool_come_in_and_drive(other, tmp_path, command):  # n
     source, like = other
     code, out, error = command(source, "--like", like, "--to", tmp_path / "new.json")
     assert code == 0 and "3 rules" in out, error
-    ours, (config, _) = runtime.read(tmp_path / "new.json"), learner("three", steps=400)
+    ours = turns_north(tmp_path / "new.json")
     far, at = np.array([0.9, 0.5, 0.2]), np.array([0.9, 0.5, 1.5])
     assert (ours.act(far), ours.act(at)) == (2, 1)
-    weights = np.exp(-0.5 * ((np.array([0.0, 1.5708]) - 0.2) / 0.5) ** 2)
-    west = np.exp(-0.5 * (0.9 / 0.2) ** 2) * weights[1]
-    expected = weights[0] / (weights.sum() + west)
-    assert ours.outputs(far)[0] == pytest.approx(expected, abs=1e-5)
-    env = make_env(config)
-    x, info = env.reset(seed=0, options={"pose": (0.15, 0.15, 0.0)})
-    action = ours.start(x)
-    for _ in range(6):
-        x, _, _, _, info = env.step(action)
-        action = ours.act(x)
-    env.close()
-    assert info["true_pose"][2] > 0.9  # it turned to the north
 
 
 SPOILT = {

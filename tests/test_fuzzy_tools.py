@@ -6,12 +6,11 @@ import subprocess
 
 import numpy as np
 import pytest
-from exported import ALL, learner, states
+from exported import ALL, learner, states, turns_north
 from test_export import command  # noqa: F401
 from test_fis import means
 
 from sofnn_torch.export import fcl, fml, policy, runtime, sugeno
-from sofnn_torch.runs.factory import make_env
 
 FORMS = {"fml": (fml.to_fml, fml.read), "fcl": (fcl.to_fcl, fcl.read)}
 
@@ -121,19 +120,7 @@ def test_rules_of_another_tool_come_in_and_drive(tmp_path, form, like, command):
     source.write_text(OTHERS[form])
     code, out, error = command(source, "--like", like, "--to", tmp_path / "new.json")
     assert code == 0 and "3 rules" in out, error
-    ours, (config, _) = runtime.read(tmp_path / "new.json"), learner("three", steps=400)
-    weights = np.exp(-0.5 * ((np.array([0.0, 1.5708]) - 0.2) / 0.5) ** 2)
-    west = np.exp(-0.5 * (0.9 / 0.2) ** 2) * weights[1]
-    expected = weights[0] / (weights.sum() + west)
-    assert ours.outputs([0.9, 0.5, 0.2])[0] == pytest.approx(expected, abs=1e-5)
-    env = make_env(config)
-    x, info = env.reset(seed=0, options={"pose": (0.15, 0.15, 0.0)})
-    action = ours.start(x)
-    for _ in range(6):
-        x, _, _, _, info = env.step(action)
-        action = ours.act(x)
-    env.close()
-    assert info["true_pose"][2] > 0.9  # it turned to the north
+    turns_north(tmp_path / "new.json")
 
 
 def test_names_of_tasks_are_made_words_of_the_languages():

@@ -85,12 +85,18 @@ def test_a_policy_of_numbers_is_followed():
     assert error() < before / 2
 
 
+def inside(agent, count, seed):
+    """States by chance in the range of a learner's axes."""
+    axes = agent.task.axes
+    low, high = (np.array([getattr(axis, end) for axis in axes]) for end in ("low", "high"))
+    chance = np.random.default_rng(seed)
+    return chance.uniform(low, high, (count, len(axes))).astype(np.float32)
+
+
 @pytest.mark.parametrize("kind", FEW)
 def test_the_fit_knows_what_the_learner_would_do(kind):
     _, agent = learner(kind)
-    axes = agent.task.axes
-    low, high = (np.array([getattr(axis, end) for axis in axes]) for end in ("low", "high"))
-    states = np.random.default_rng(2).uniform(low, high, (200, len(axes))).astype(np.float32)
+    states = inside(agent, 200, seed=2)
     fit = Fit(agent, states, 12, seed=0)
     x = torch.from_numpy(states)
     scores = fit.scores(x, fit.outputs(x)).numpy()
@@ -105,9 +111,7 @@ def test_the_fit_knows_what_the_learner_would_do(kind):
 @pytest.mark.parametrize("kind", FEW)
 def test_rules_that_are_found_are_rules_that_the_learner_may_have(kind):
     config, agent = learner(kind)
-    axes = agent.task.axes
-    low, high = (np.array([getattr(axis, end) for axis in axes]) for end in ("low", "high"))
-    states = np.random.default_rng(3).uniform(low, high, (300, len(axes))).astype(np.float32)
+    states = inside(agent, 300, seed=3)
     fit = Fit(agent, states, 9, seed=0)
     fit.improve(states, 30)
     small = make_agent(config)

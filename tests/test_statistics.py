@@ -4,15 +4,11 @@ import math
 
 import numpy as np
 import pytest
+from conftest import fixed_interval
 from scipy import stats
 
 from sofnn_torch.studies import statistics
-from sofnn_torch.studies.statistics import FAILS, HOLDS, OPEN, Measured, judge, verdicts
-
-
-def fixed(value, low=math.nan, high=math.nan):
-    """A number whose interval is the same at every level."""
-    return Measured(value, lambda level: (low, high))
+from sofnn_torch.studies.statistics import FAILS, HOLDS, OPEN, judge, verdicts
 
 
 def covered(measured, truth):
@@ -92,15 +88,15 @@ def test_shares_are_exact_and_wider_if_seeds_differ():
     ],
 )
 def test_verdicts_are_of_whole_intervals(interval, verdict):
-    assert judge(fixed(0.5, *interval), 0.5, 1) == verdict
-    assert verdicts([(fixed(0.5, *interval), 0.5, 1)]) == [verdict]
+    assert judge(fixed_interval(0.5, *interval), 0.5, 1) == verdict
+    assert verdicts([(fixed_interval(0.5, *interval), 0.5, 1)]) == [verdict]
 
 
 def test_the_doubt_of_a_share_is_the_binomial_p_value():
     # 9 of 10 against a half: both tails of 11 in 1024.
     found = statistics.doubt(statistics.proportion(9, 10), 0.5, 1)
     assert found == pytest.approx(2 * 11 / 1024, rel=1e-3)
-    assert statistics.doubt(fixed(math.nan), 0, 1) == 1
+    assert statistics.doubt(fixed_interval(math.nan), 0, 1) == 1
 
 
 def test_verdicts_of_a_family_follow_holm():

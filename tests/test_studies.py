@@ -9,6 +9,7 @@ import sys
 
 import numpy as np
 import pytest
+from conftest import fixed_interval
 from PIL import Image
 
 from sofnn_torch import cli, evaluate, training
@@ -257,10 +258,6 @@ def test_the_scattered_start_is_near_the_start_and_seeded():
 
 
 # ------------------------------------------------------------------- statistics and the report
-
-
-def fixed_interval(value, low=math.nan, high=math.nan):
-    return statistics.Measured(value, lambda level: (low, high))
 
 
 @pytest.mark.parametrize(
