@@ -52,7 +52,7 @@ def fresh(
     """Return a function that begins a run in a directory."""
     config = Config(agent=name, network="sofnn")
     if not replay:
-        part = dataclasses.replace(getattr(config, name), replays=0)
+        part = dataclasses.replace(getattr(config, name), replays=0, replay_every=0)
         config = dataclasses.replace(config, **{name: part})
     net = dataclasses.replace(config.net, max_rules=rules + 5_000)
     maze = dataclasses.replace(config.maze, max_steps=MAX_STEPS)

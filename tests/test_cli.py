@@ -269,7 +269,7 @@ def test_growth_without_end_stops_at_the_limit_and_says_so(agent, here, capsys):
         ("--agent q --net.width-action 1", "no effect without --q.coding antecedent"),
         ("--sga.constant 1", "--sga.constant has no effect with --sga.baseline value"),
         ("--preset paper --sga.rate-value 2", "has no effect without a learned baseline"),
-        ("--sga.replays 0 --sga.memory 9", "--sga.memory has no effect with --sga.replays 0"),
+        ("--sga.replays 0 --sga.memory 9", "--sga.memory has no effect without replay"),
         ("--workers 2", "--workers has no effect without --seeds"),
         ("--cluster slurm", "--cluster has no effect without --seeds"),
         (

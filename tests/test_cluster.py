@@ -32,6 +32,7 @@ SEEDS = range(3)
 TRIALS = 12
 FLAGS = (  # those of `config` and `quick_options`
     "--agent q --network fixed --net.grid 4 4 4 --maze.max-steps 5000 --q.replays 0 "
+    "--q.replay-every 0 "
     "--quiet --checkpoint-every 2 --picture-every 0 --video-every 0"
 )
 LIGHT = f"""
@@ -223,7 +224,9 @@ def disk(request, monkeypatch):
 
 
 def config(trials):
-    return short("q", "fixed", trials=trials, maze={"max_steps": 5000}, q={"replays": 0})
+    return short(
+        "q", "fixed", trials=trials, maze={"max_steps": 5000}, q={"replays": 0, "replay_every": 0}
+    )
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ from sofnn_torch import SGA, Agent, Axis, Config, QLearning, evaluate, training
 from sofnn_torch.runs import checkpoint
 from sofnn_torch.runs.session import arithmetic
 
-FEW = {"net": {"max_rules": 100}, "replays": 1}
+FEW = {"net": {"max_rules": 100}, "replays": 1, "replay_every": 0}
 
 
 class Toy(gymnasium.Env):
@@ -51,7 +51,7 @@ def test_an_agent_learns_what_the_command_learns(learner, tmp_path):
     config = Config(env="MountainCar-v0", agent=learner.name, seed=3, trials=2)
     changes = {
         "net": dataclasses.replace(config.net, max_rules=100),
-        learner.name: dataclasses.replace(config.learner_settings, replays=1),
+        learner.name: dataclasses.replace(config.learner_settings, replays=1, replay_every=0),
     }
     config = dataclasses.replace(config, **changes)
     run = training.train(config, quick_options(tmp_path))

@@ -104,7 +104,7 @@ def test_q_replay_is_the_bounded_sum_of_semi_gradients(coding, gap, batch):
     rate = np.array([0.1] * 3 + [0.2] * (length - 4) + [0.3])
     assert [reward for reward in rows[:3, length]] == REWARDS and rows[2, length + 1] == 0
     agent.rng = np.random.default_rng(0)
-    agent._replay(agent.memory)
+    agent._replay(agent.memory, agent.settings.replays)
     np.testing.assert_allclose(
         net.consequents.numpy(), before + rate * total / np.maximum(mass, 1), rtol=1e-9, atol=1e-12
     )
@@ -147,7 +147,7 @@ def test_sga_replay_weighs_each_decision_by_its_likelihood(m, scaled, batch):
     expected[:, :m] = expected[:, :m].clip(-1, 1)
     expected[:, m : 2 * m] = expected[:, m : 2 * m].clip(0.03, 9)
     agent.rng = np.random.default_rng(0)
-    agent._replay(agent.memory)
+    agent._replay(agent.memory, agent.settings.replays)
     np.testing.assert_allclose(net.consequents.numpy(), expected, rtol=1e-9, atol=1e-12)
 
 
@@ -188,6 +188,17 @@ def test_replays_begin_with_the_second_trial_and_leave_the_antecedents(make):
 
 
 @pytest.mark.parametrize("make", [q_learner, sga_learner])
+@pytest.mark.parametrize("every", [1, 2])
+def test_a_batch_is_replayed_in_the_trial_after_every_so_many_decisions(make, every, monkeypatch):
+    agent, after = make(replays=0, replay_every=every), []
+    monkeypatch.setattr(agent, "_replay", lambda memory, n: after.append((memory.count, n)))
+    play(agent)
+    decisions = agent.memory.count
+    assert after == [(count, 1) for count in range(every, decisions + 1, every)]
+    assert agent.statistics()["learning/replayed"] == 64 * len(after)
+
+
+@pytest.mark.parametrize("make", [q_learner, sga_learner])
 def test_a_copy_made_by_state_replays_alike(make):
     one, other = make(replays=3), make(replays=3, seed=1)
     play(one)
@@ -197,8 +208,9 @@ def test_a_copy_made_by_state_replays_alike(make):
 
 
 def test_sga_needs_the_learned_baseline_to_replay():
-    with pytest.raises(ValueError, match="baseline"):
-        sga_learner(baseline="constant", replays=1)
+    for replay in ({"replays": 1}, {"replays": 0, "replay_every": 1}):
+        with pytest.raises(ValueError, match="baseline"):
+            sga_learner(baseline="constant", **replay)
 
 
 @pytest.mark.parametrize("make", [q_learner, sga_learner])

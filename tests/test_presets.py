@@ -63,6 +63,7 @@ READ = {
         "q.value_limit": None,
         "q.initial": 0.0,
         "q.replays": 0,
+        "q.replay_every": 0,
     },
     "both": {
         "net.theta": 0.5,

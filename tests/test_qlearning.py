@@ -45,7 +45,7 @@ def learner(
         centre = torch.rand(inputs).double() * 2 - 1
         centre[2] *= math.pi
         net.add_rule(centre, 0.2 + torch.rand(inputs).double(), torch.randn(outputs).double())
-    settings = {"value_limit": None, "replays": 0, "action_gap": 0.0} | settings
+    settings = {"value_limit": None, "replays": 0, "replay_every": 0, "action_gap": 0.0} | settings
     names = ("right", "straight", "left") if actions == "three" else ("steer",)
     task = Task(net.axes[:N], names, actions == "three", wheel_speeds)
     return QLearning(net, task, QConfig(coding=coding, segments=segments, **settings), seed)

@@ -4,6 +4,7 @@ import dataclasses
 import json
 import math
 from types import SimpleNamespace
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -11,7 +12,8 @@ import pytest
 from sofnn_torch.pictures import figures
 from sofnn_torch.runs.trial import Trajectory
 from sofnn_torch.studies import claims, collecting, drawing, report, results, robustness, running
-from sofnn_torch.studies.studies import settings
+from sofnn_torch.studies.__main__ import Name
+from sofnn_torch.studies.studies import STUDIES, settings
 
 OPTIMUM, LIMIT = 468, 20_000
 POSE_NAMES = ("x", "y", "heading", "x_estimated", "y_estimated", "heading_estimated")
@@ -266,23 +268,29 @@ def test_a_run_that_never_learns_counts_as_one_trial_more_than_it_had():
 
 
 def test_a_row_sums_up_one_run(tmp_path):
-    head = "trial,steps,success,rules\n"
-    (tmp_path / "trials.csv").write_text(head + "1,20000,False,5\n2,500,True,6\n3,400,True,9\n")
+    head = "trial,steps,decisions,success,rules,learning/replayed\n"
+    lines = ["1,20000,2000,False,5,0", "2,500,60,True,6,640", "3,400,50,True,9,320"]
+    (tmp_path / "trials.csv").write_text(head + "\n".join(lines) + "\n")
     (tmp_path / "seconds.csv").write_text("10.0,1.0\n30.0,2.5\n")
     records = [
-        {"success": True, "steps": 450, "collisions": 0},
-        {"success": False, "steps": 20_000, "collisions": 3},
+        {"success": True, "steps": 450, "collisions": 0, "freed": 0},
+        {"success": False, "steps": 20_000, "collisions": 3, "freed": 7},
     ]
-    evaluation = {"greedy": records, "sampled": records[:1]}
+    evaluation = {"greedy": records, "plain": records[1:], "sampled": records[:1]}
     (tmp_path / "evaluation.json").write_text(json.dumps(evaluation))
     row = collecting._row(tmp_path, settings({"agent": "sga"}), OPTIMUM)
-    assert math.isnan(row.pop("trials_to_learn"))
+    for quantity in ("trials", "steps", "decisions", "replayed"):
+        assert math.isnan(row.pop(f"{quantity}_to_learn"))
     assert row == {
         "status": "done",
         "trials": settings({"agent": "sga"}).trials,
         "greedy_success": 0.5,
         "greedy_steps": 10_225,
         "greedy_collisions": 1.5,
+        "trials_freed": 1,
+        "plain_success": 0,
+        "plain_steps": 20_000,
+        "plain_collisions": 3,
         "sampled_success": 1,
         "sampled_steps": 450,
         "sampled_collisions": 0,
@@ -291,6 +299,30 @@ def test_a_row_sums_up_one_run(tmp_path):
         "wall_seconds": 40,
         "cpu_seconds": 3.5,
     }
+
+
+def test_what_learning_took_is_summed_until_the_run_had_learned(tmp_path):
+    head = "trial,steps,decisions,success,rules,learning/replayed\n"
+    lines = [f"{n},{900 if n < 3 else 500},{50 + n},True,{n},{64 * n}" for n in range(1, 20)]
+    (tmp_path / "trials.csv").write_text(head + "\n".join(lines) + "\n")
+    (tmp_path / "evaluation.json").write_text("{}")
+    row = collecting._row(tmp_path, settings({"agent": "sga"}), OPTIMUM)
+    assert row["trials_to_learn"] == 12  # ten in a row from the third on
+    assert row["steps_to_learn"] == 2 * 900 + 10 * 500
+    assert row["decisions_to_learn"] == 12 * 50 + 78
+    assert row["replayed_to_learn"] == 64 * 78
+
+
+def test_half_of_the_runs_decide_whether_learning_came_to_an_end():
+    rows = [{"arm": "q-x", "steps_to_learn": n} for n in (100, 200, 300, "nan", "nan")]
+    data = results.Data({}, rows, {})
+    assert results.until_learned(data, "q-x", "steps") == "300 (100 to never)"
+    rows[0]["steps_to_learn"] = "nan"
+    assert results.until_learned(data, "q-x", "steps") == "never (200 to never)"
+
+
+def test_every_study_can_be_asked_for():
+    assert set(get_args(Name)) == set(STUDIES)
 
 
 def test_paths_keep_true_and_estimated_poses_apart(tmp_path):
@@ -417,9 +449,9 @@ def test_the_greedy_policy_is_evaluated_without_chance_and_the_last_path_is_kept
         def row(self):
             return dataclasses.asdict(self)
 
-    def evaluated(config, agent, episodes, explore, seed):
-        played.append((episodes, explore, seed))
-        return [Record(2 if explore else 1)]
+    def evaluated(config, agent, episodes, explore, seed, plain):
+        played.append((episodes, explore, seed, plain))
+        return [Record(2 if explore else 3 if plain else 1)]
 
     true, estimated = np.array([[1.0, 2, 3]]), np.array([[4.0, 5, 6]])
     config = settings({"agent": "sga"}, seed=7)
@@ -430,6 +462,7 @@ def test_the_greedy_policy_is_evaluated_without_chance_and_the_last_path_is_kept
     last = Record(9), Trajectory(true, estimated)
     monkeypatch.setattr(running, "last_trial", lambda path: last)
     data = running._train_and_evaluate(tmp_path, config)
-    assert played == [(running.EPISODES, False, 1007), (running.EPISODES, True, 1007)]
-    assert (data["greedy"], data["sampled"]) == ([{"steps": 1}], [{"steps": 2}])
+    each = [(False, False), (False, True), (True, False)]  # greedy, plain, sampled
+    assert played == [(running.EPISODES, explore, 1007, plain) for explore, plain in each]
+    assert [data[name][0]["steps"] for name in ("greedy", "plain", "sampled")] == [1, 3, 2]
     assert data["last_trial"] == {"steps": 9, "true": [[1, 2, 3]], "estimated": [[4, 5, 6]]}

@@ -175,7 +175,7 @@ def test_the_generators_of_the_process_have_no_influence(tmp_path, same_run):
 
 @pytest.mark.parametrize("agent", ["sga", "q"])
 def test_the_number_of_threads_has_no_influence_without_replay(agent, tmp_path, same_run):
-    parts = {"net": {"grid": (16, 16, 8)}, agent: {"replays": 0}}  # 2048 rules
+    parts = {"net": {"grid": (16, 16, 8)}, agent: {"replays": 0, "replay_every": 0}}  # 2048 rules
     config = settings(agent, "fixed", trials=2, **parts)
     for threads in (1, 4):
         options = quick_options(tmp_path, name=str(threads), threads=threads)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sofnn_torch.bounds import Settings
-from sofnn_torch.learners.memory import ReplayMemory
+from sofnn_torch.learners.memory import BATCH, ReplayMemory
 from sofnn_torch.network.axes import Axis
 from sofnn_torch.network.sofnn import SOFNN
 
@@ -203,7 +203,7 @@ class Learner(ABC):
         """Begin a trial at the observation (n,): clear the traces, choose the first action."""
         self.net.traces.zero_()
         if self.memory:
-            self._replay(self.memory)
+            self._learn_again(self.settings.replays)
         x = self._tensor(observation)
         return self._choose(x, self._firing(x))
 
@@ -225,13 +225,14 @@ class Learner(ABC):
         reward = reward * self.task.reward_scale
         if self.memory is not None:
             self.memory.add([*self.decision, reward, not terminated, *observation.tolist()])
-        if terminated:
-            self._learn(self._error(reward))
-            return None
-        x = self._tensor(observation)
-        firing = self._firing(x)
+        x = None if terminated else self._tensor(observation)
+        firing = None if x is None else self._firing(x)
         self._learn(self._error(reward, x, firing))
-        return None if truncated else self._choose(x, firing)
+        if self.memory and (every := self.settings.replay_every):
+            self._learn_again(int(self.memory.count % every == 0))
+        if x is None or firing is None or truncated:
+            return None
+        return self._choose(x, firing)
 
     @abstractmethod
     def act(self, observation: NDArray[Any], explore: float = 0) -> Action:
@@ -267,8 +268,14 @@ class Learner(ABC):
     def _policy(self, x: Tensor) -> tuple[Tensor, Tensor | None]:
         """At states (B, n): actions (B, m), or numbers among `choices` (B,), and values (B,)."""
 
-    def _replay(self, memory: ReplayMemory) -> None:  # noqa: B027, not all learners do
-        """Learn again from remembered decisions, at the beginning of a trial."""
+    def _replay(self, memory: ReplayMemory, batches: int) -> None:  # noqa: B027, not all do
+        """Learn again from batches of remembered decisions; the antecedents stay."""
+
+    def _learn_again(self, batches: int) -> None:
+        """Replay so many batches, and count what they hold."""
+        if self.memory and batches:
+            self._replay(self.memory, batches)
+            self._log["replayed"].append(batches * BATCH)
 
     def _firing(self, x: Tensor) -> Tensor:
         """Let the network grow at a state (n,); its normalised firing there."""
@@ -348,6 +355,7 @@ class Learner(ABC):
         return (
             self._summary(log)
             | {"learning/error_rms": error.square().mean().sqrt().item()}
+            | {"learning/replayed": sum(log["replayed"])}
             | self.net.statistics(log["firing"])
         )
 
@@ -379,7 +387,10 @@ class Learner(ABC):
             self.memory.load_state_dict(state["memory"])
 
     def _remember(self, fields: dict[str, int], capacity: int) -> None:
-        """Keep a memory of decisions with these fields, and what they led to."""
+        """Keep a memory of decisions with these fields, and what they led to.
+
+        Settings ``replays`` and ``replay_every`` say when `_replay` learns from it.
+        """
         dtype = self.net.default_width.cpu().numpy().dtype
         after = {"reward": 0, "continues": 0, "next_state": len(self.task.axes)}
         self.memory = ReplayMemory(fields | after, capacity, dtype)

@@ -77,15 +77,17 @@ class QConfig(Settings, table="q"):
     """Learning rate of the widths v; 0 leaves them as they are."""
     initial: float = 65.0
     """Initial c of a rule, the value of an unknown state; optimistic at the start of the maze."""
-    replays: Annotated[int, Within(least=0)] = 100
+    replays: Annotated[int, Within(least=0)] = 50
     """Batches of remembered decisions to learn from again at the beginning of each trial; 0 for
     none."""
+    replay_every: Annotated[int, Within(least=0)] = 1
+    """Decisions after each of which one more batch is learned from, in the trial; 0 for none."""
     memory: Annotated[Count, Within(most=10_000_000)] = 20_000
     """Decisions that are remembered."""
 
     def idle(self) -> dict[str, str]:
         """Settings that change nothing beside the others, and why."""
-        return {} if self.replays else {"memory": "with --q.replays 0"}
+        return {} if self.replays or self.replay_every else {"memory": "without replay"}
 
 
 class QLearning(Learner):
@@ -138,7 +140,7 @@ class QLearning(Learner):
         codes = [self._code(j, a) for j, a in enumerate(self.representatives)]
         self.codes = self.rates.new_tensor(codes)  # (J, length)
         self.tails = torch.cat([self.codes, self.codes.new_ones(segments, 1)], 1)
-        if settings.replays:
+        if settings.replays or settings.replay_every:
             self._remember({"features": net.n_outputs}, settings.memory)
 
     @classmethod
@@ -294,11 +296,11 @@ class QLearning(Learner):
         self._log["error"].append(error)
         self.net.adapt(self.rates, error)
 
-    def _replay(self, memory: ReplayMemory) -> None:
+    def _replay(self, memory: ReplayMemory, batches: int) -> None:
         """Equations 12-15 for batches of remembered decisions; the antecedents stay."""
         net, (features_of, firing_at) = self.net, self.net.firing_functions()
         gap, acting = self.settings.action_gap, self.coding == "antecedent"
-        seen = memory.sample(self.settings.replays, self.rng, self.rates)
+        seen = memory.sample(batches, self.rng, self.rates)
         states = features_of(seen["features"][..., : net.n_inputs])
         next_states = features_of(self.network_inputs(seen["next_state"]))
         for x, next_x, *row in zip(states, next_states, *seen.values(), strict=True):

@@ -39,7 +39,7 @@ class SGAConfig(Settings, table="sga"):
 
     Examples:
         >>> SGAConfig(replays=0).idle()
-        {'constant': 'with --sga.baseline value', 'memory': 'with --sga.replays 0'}
+        {'constant': 'with --sga.baseline value', 'memory': 'without replay'}
     """
 
     gamma: Share = 0.99
@@ -80,6 +80,9 @@ class SGAConfig(Settings, table="sga"):
     replays: Annotated[int, Within(least=0)] = 100
     """Batches of remembered decisions to learn from again at the beginning of each trial; 0 for
     none. Needs baseline `value`."""
+    replay_every: Annotated[int, Within(least=0)] = 0
+    """Decisions after each of which one more batch is learned from, in the trial; 0 for none. Needs
+    baseline `value`."""
     memory: Annotated[Count, Within(most=10_000_000)] = 20_000
     """Decisions that are remembered."""
 
@@ -88,8 +91,10 @@ class SGAConfig(Settings, table="sga"):
         super().__post_init__()
         if not self.sigma_min <= self.sigma_initial <= self.sigma_max:
             raise ValueError("need --sga.sigma-min <= --sga.sigma-initial <= --sga.sigma-max")
-        if self.replays and self.baseline == "constant":
-            raise ValueError("--sga.replays needs --sga.baseline value: set --sga.replays 0")
+        for name in ("replays", "replay_every"):
+            if getattr(self, name) and self.baseline == "constant":
+                flag = f"--sga.{name.replace('_', '-')}"
+                raise ValueError(f"{flag} needs --sga.baseline value: set {flag} 0")
 
     def idle(self) -> dict[str, str]:
         """Settings that change nothing beside the others, and why."""
@@ -98,7 +103,9 @@ class SGAConfig(Settings, table="sga"):
             ("rate_value", "initial_value", "value_limit"), "without a learned baseline"
         )
         idle = {"constant": valued} if self.baseline == "value" else constant
-        return idle if self.replays else idle | {"memory": "with --sga.replays 0"}
+        if self.replays or self.replay_every:
+            return idle
+        return idle | {"memory": "without replay"}
 
 
 def negative_log_likelihood(action: Tensor, mean: Tensor, deviation: Tensor) -> Tensor:
@@ -154,7 +161,7 @@ class SGA(Learner):
         # Between them lie the parts of the range that stand for discrete actions.
         parts = len(task.actions)
         self.edges = [(2 * j - parts) / parts for j in range(1, parts)]
-        if settings.replays:
+        if settings.replays or settings.replay_every:
             fields = {"state": net.n_inputs, "action": m, "negative_log_likelihood": 0}
             self._remember(fields, settings.memory)
 
@@ -256,14 +263,14 @@ class SGA(Learner):
         self.net.clamp_consequents(0, m, -settings.mean_limit, settings.mean_limit)
         self.net.clamp_consequents(m, 2 * m, settings.sigma_min, settings.sigma_max)
 
-    def _replay(self, memory: ReplayMemory) -> None:
+    def _replay(self, memory: ReplayMemory, batches: int) -> None:
         """Equations 5-8 without traces for batches of remembered decisions; the antecedents stay.
 
         Another policy took them: each counts min(1, pi(a | x) now / then) (Wawrzynski, Neural
         Networks 22, 2009; Espeholt et al., ICML 2018).
         """
         net, (features, firing_at) = self.net, self.net.firing_functions()
-        seen = memory.sample(self.settings.replays, self.rng, self.rates)
+        seen = memory.sample(batches, self.rng, self.rates)
         states, next_states = features(seen.pop("state")), features(seen.pop("next_state"))
         for x, next_x, *row in zip(states, next_states, *seen.values(), strict=True):
             action, then, reward, continues = row

@@ -141,7 +141,7 @@ class SOFNN(RuleTable):
             if torch.is_autocast_enabled(x.device.type):  # what cancels needs all its digits
                 with torch.autocast(x.device.type, enabled=False):
                     return self.normalised_firing(x, (centres, widths))
-            factors = batches.factors(centres, widths, self.wrapping)
+            factors = batches.factors(centres.double(), widths.double(), self.wrapping)
             features = batches.features(x.to(factors), self.wrapping)
             log_firing = batches.log_firing(features, factors, self.wrapping)
         else:

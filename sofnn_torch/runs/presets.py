@@ -52,6 +52,7 @@ def task_tables(agent: str, network: str, found: Spaces) -> dict[str, Any]:
         initial=found.best,
         value_limit=found.best,
         replays=20,
+        replay_every=0,
     )
     return {"net": net, "sga": sga, "q": q, "maze": MazeConfig()}
 
@@ -66,7 +67,7 @@ def careful(tables: dict[str, Any]) -> dict[str, Any]:
     changes: dict[str, dict[str, Any]] = {
         "net": {"growth": "frozen"},
         "sga": {"replays": 0, "rate_value": 0.3},
-        "q": {"replays": 0},
+        "q": {"replays": 0, "replay_every": 0},
     }
     return tables | {name: replace(tables[name], **part) for name, part in changes.items()}
 
@@ -112,6 +113,7 @@ def _paper(agent: str) -> dict[str, Any]:
         rate_width=0.001,
         initial=0.0,
         replays=0,
+        replay_every=0,
     )
     goal, collision = (100.0, -0.1) if agent == "q" else (1.0, -1e-4)
     maze = MazeConfig(

@@ -29,15 +29,15 @@ from sofnn_torch.maze.robot import checked, plan_of
 from sofnn_torch.runs import parallel
 from sofnn_torch.studies import collecting, report, running
 
+Name = Literal["section5", "paper", "growth", "ablation", "sensors", "fixed", "robustness"]
+
 
 @dataclass(frozen=True)
 class Options(Settings):
     """Run studies, or only write their tables and figures anew."""
 
-    study: tuple[Literal["section5", "paper", "growth", "ablation", "fixed", "robustness"], ...] = (
-        "section5",
-    )
-    """Studies to run; all of them: section5 paper growth ablation fixed robustness."""
+    study: tuple[Name, ...] = ("section5",)
+    """Studies to run; all of them: section5 paper growth ablation sensors fixed robustness."""
     arms: str = ""
     """Only the arms whose name contains this text, e.g. `sofnn` or `q-no`."""
     seeds: str | None = None

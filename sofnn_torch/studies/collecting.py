@@ -14,10 +14,11 @@ import numpy as np
 from sofnn_torch.pictures.figures import read_column
 from sofnn_torch.runs.settings import Config
 from sofnn_torch.studies.results import write_table
-from sofnn_torch.studies.running import EPISODES, PLAYED, find_runs, sittings
+from sofnn_torch.studies.running import EPISODES, PLAYED, POLICIES, find_runs, sittings
 from sofnn_torch.studies.studies import STUDIES, changed, essence, settings
 
 IN_A_ROW, WITHIN = 10, 1.5  # learned: so many trials in a row under so many times the optimum
+TAKEN = {"steps": "steps", "decisions": "decisions", "replayed": "learning/replayed"}
 
 
 def collect(
@@ -111,19 +112,27 @@ def _row(path: Path, config: Config, optimum: int) -> dict[str, Any]:
     try:
         steps, success = read_column(table, "steps"), read_column(table, "success")
         rules, total = int(read_column(table, "rules")[-1]), int(steps.sum())
+        taken = {name: read_column(table, column) for name, column in TAKEN.items()}
     except (ValueError, OSError):  # diverged in its first trial
         steps, success, rules, total = np.zeros(0), np.zeros(0), 0, 0
+        taken = dict.fromkeys(TAKEN, steps)
+    learned = trials_to_learn(steps, success, optimum)
     row = {
         "status": "diverged" if "diverged" in results else "done",
         "trials": config.trials,
-        "trials_to_learn": trials_to_learn(steps, success, optimum),
+        "trials_to_learn": learned,
     }
-    for policy in ("greedy", "sampled"):
+    for name, counts in taken.items():
+        never = math.isnan(learned)
+        row[f"{name}_to_learn"] = learned if never else int(counts[: int(learned)].sum())
+    for policy in POLICIES:
         failure = [{"steps": config.maze.max_steps, "success": False, "collisions": math.nan}]
         records = results.get(policy, failure)
         for quantity in ("success", "steps", "collisions"):
             values = [record[quantity] for record in records]
             row[f"{policy}_{quantity}"] = round(float(np.mean(values)), 4)
+        if policy == "greedy":
+            row["trials_freed"] = sum(bool(record.get("freed")) for record in records)
     wall = cpu = 0.0
     if (path / "seconds.csv").exists():  # a sitting that was killed leaves no line
         wall, cpu = np.loadtxt(path / "seconds.csv", delimiter=",", ndmin=2).sum(0).round(1)

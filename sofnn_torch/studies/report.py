@@ -9,7 +9,15 @@ import numpy as np
 from sofnn_torch.studies import drawing
 from sofnn_torch.studies.claims import GOALS, HOW, SWAPPED, arriving, claims, closing_table, goals
 from sofnn_torch.studies.drawing import AGENTS
-from sofnn_torch.studies.results import Data, cell, learned_after, markdown, read, success
+from sofnn_torch.studies.results import (
+    Data,
+    cell,
+    learned_after,
+    markdown,
+    read,
+    success,
+    until_learned,
+)
 from sofnn_torch.studies.robustness import EPISODES
 from sofnn_torch.studies.statistics import median, ratio, share
 from sofnn_torch.studies.studies import STUDIES
@@ -25,9 +33,15 @@ at the goal. *Trials to learn* is the trial that completes the first {in_a_row} 
 counts as more than its number of trials. What was
 learned is then played for {episodes} trials without learning: *greedy* is the mean action (SGA) or
 the best one (Q), *sampled* the stochastic policy of the training; both gain chance where they run
-in [circles](../paper.md#what-plays-in-an-evaluation-and-loops). A trial that fails counts with its
+in [circles](../paper.md#what-plays-in-an-evaluation-and-loops). *Plain* is greedy without that, and
+*freed* counts the greedy trials in which chance was given. A trial that fails counts with its
 {limit:,} steps. The kinematic optimum of the maze, with actions held 10 steps, is {optimum} steps
 (`python -m sofnn_torch.maze.optimum`)."""
+TAKEN = """\
+Sums over the trials until a run had learned, medians over the seeds; a seed that did not counts as
+*never*. Each replayed decision is one drawn
+from the memory and learned from again; batches hold 64. The processor time is that of all trials,
+of pictures and checkpoints, and of the evaluation."""
 DIVERGED = """\
 A seed *diverged* if its numbers left all bounds, where the training stops. It counts as one that
 never reaches the goal, with the rules of its last whole trial; an arm of nothing else shows `-`."""
@@ -50,6 +64,9 @@ def arm_table(data: Data, arms: Sequence[str]) -> str:
         "success, greedy [%]",
     ]
     head += ["steps, greedy", "over the optimum", *["over the default"] * bool(base)]
+    plain = data.has("plain_steps")
+    if plain:
+        head += ["success, plain [%]", "steps, plain", "trials freed"]
     head += ["success, sampled [%]", "steps, sampled", "collisions a trial", "rules"]
     rows = []
     for arm in arms:
@@ -69,6 +86,13 @@ def arm_table(data: Data, arms: Sequence[str]) -> str:
         if base:
             compared = ratio(greedy, data.column(base, "greedy_steps"))
             row.append(cell(compared, 2) if arm != base else "1")
+        if plain:
+            freed, trials = data.column(arm, "trials_freed").sum(), data.info["episodes"]
+            row += [
+                cell(success(data, arm, "plain"), 1, 100),
+                cell(median(data.column(arm, "plain_steps"))),
+                f"{freed:.0f} of {trials * len(greedy)}",
+            ]
         row += [
             cell(success(data, arm, "sampled"), 1, 100),
             cell(median(data.column(arm, "sampled_steps"))),
@@ -77,6 +101,20 @@ def arm_table(data: Data, arms: Sequence[str]) -> str:
         ]
         rows.append(row)
     return markdown(head, rows, 1 + changes)
+
+
+def learning_table(data: Data) -> str:
+    """What each arm took until it had learned."""
+    head = ["arm", "trials", "steps of the environment", "decisions taken", "decisions replayed"]
+    head += ["processor time of a whole run [s]"]
+    rows = []
+    for arm in data.arms():
+        if data.diverged(arm) < len(data.column(arm, "trials")):
+            took = (until_learned(data, arm, name) for name in ("steps", "decisions", "replayed"))
+            trials = cell(learned_after(data, arm), limit=data.column(arm, "trials")[0])
+            seconds = cell(median(data.column(arm, "cpu_seconds")))
+            rows.append([arm, trials, *took, seconds])
+    return markdown(head, rows)
 
 
 def arm_tables(data: Data) -> str:
@@ -146,6 +184,8 @@ def page(out: Path, data: Data) -> str:
             *(f"![{text.partition(':')[0]}]({name}.png)\n\n*{text}*" for name, text in captions),
         ]
     parts += ["## All arms", arm_tables(data), NOTES.format(limit=limit, **info)]
+    if data.has("steps_to_learn"):
+        parts += ["## What learning took", learning_table(data), TAKEN]
     parts += [DIVERGED] * bool(data.diverged(*info["arms"]))
     return "\n\n".join(part.strip() for part in [*parts, "## Provenance", provenance(info)]) + "\n"
 

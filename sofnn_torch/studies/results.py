@@ -16,6 +16,8 @@ from sofnn_torch.maze.layouts import STANDARD
 from sofnn_torch.numerals import decimal
 from sofnn_torch.studies.statistics import Measured, median, share
 
+NEVER = 1e15  # more than any run takes
+
 
 @dataclass(frozen=True)
 class Data:
@@ -44,6 +46,10 @@ class Data:
     def column(self, arm: str, column: str) -> NDArray[np.float64]:
         """A column over the seeds of an arm; empty if the arm has no run."""
         return np.array([_number(row[column]) for row in self.rows if row["arm"] == arm], float)
+
+    def has(self, column: str) -> bool:
+        """Whether the data has a column; that of earlier versions lacks some."""
+        return column in self.rows[0]
 
     def diverged(self, *arms: str) -> int:
         """How many runs of the arms diverged."""
@@ -114,6 +120,12 @@ def censored(data: Data, arm: str) -> NDArray[np.float64]:
     return np.where(np.isnan(values), limits + 1, values)
 
 
+def until_learned(data: Data, arm: str, quantity: str) -> str:
+    """Median of what a run took until it had learned: ``steps``, ``decisions`` or ``replayed``."""
+    values = data.column(arm, f"{quantity}_to_learn")
+    return cell(median(np.where(np.isnan(values), NEVER, values)))
+
+
 def success(data: Data, arm: str, policy: str) -> Measured:
     """Share of the evaluation trials of all seeds that reached the goal."""
     episodes = data.info["episodes"]
@@ -136,6 +148,8 @@ def cell(measured: Measured, digits: int = 0, factor: float = 1, limit: float = 
     """
 
     def show(value: float) -> str:
+        if value >= NEVER:
+            return "never"
         if factor * value > limit:
             return f"> {limit:,.{digits}f}"
         return f"{factor * value + 1e-9:,.{digits}f}"  # halves go up, not to the even number

@@ -25,6 +25,7 @@ from sofnn_torch.runs.trial import Trajectory, TrialRecord
 from sofnn_torch.studies.robustness import under_conditions
 from sofnn_torch.studies.studies import STUDIES, essence, settings
 
+POLICIES = ("greedy", "plain", "sampled")
 EPISODES = 20  # evaluation trials of a run, for each policy
 PLAYED = "played-with.json"  # versions of the software, and the processor
 WORK = "sofnn_torch.studies.running:work"
@@ -151,12 +152,10 @@ def _process(job: Job) -> jobs.Job:
 
 
 def _is_evaluated(path: Path) -> bool:
-    """It was played, and for as many trials as today."""
+    """It was played, by all policies and for as many trials as today."""
     with contextlib.suppress(OSError, ValueError):
-        return json.loads((path / "evaluation.json").read_bytes()).get("episodes") in (
-            EPISODES,
-            None,
-        )
+        found = json.loads((path / "evaluation.json").read_bytes())
+        return "diverged" in found or (found.get("episodes") == EPISODES and "plain" in found)
     return False
 
 
@@ -199,9 +198,9 @@ def _train_and_evaluate(
         return {"diverged": str(error)}
     config, agent, _, _ = evaluate.load(path)
     results: dict[str, Any] = {"episodes": EPISODES, "seed": 1000 + config.seed}
-    for policy in ("greedy", "sampled"):
-        explore = policy == "sampled"
-        records = evaluate.evaluate(config, agent, EPISODES, explore, results["seed"])
+    for policy in POLICIES:
+        explore, plain = policy == "sampled", policy == "plain"
+        records = evaluate.evaluate(config, agent, EPISODES, explore, results["seed"], plain=plain)
         results[policy] = [record.row() for record in records]
     if read_column(path / "trials.csv", "success")[-1]:
         record, trajectory = last_trial(path)

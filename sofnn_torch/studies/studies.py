@@ -76,6 +76,7 @@ HELPS: dict[str, dict[str, Arm]] = {
     "sga": {
         "no-replay": {"sga.replays": 0},
         "replays-times-0.2": {"sga.replays": 20},
+        "replay-each-decision": {"sga.replays": 0, "sga.replay_every": 1},
         "no-value-baseline": {"sga.baseline": "constant", "sga.replays": 0},
         "no-optimism": {"sga.initial_value": 0.0},
         "goal-as-optimism": {"sga.initial_value": 1.0},
@@ -100,8 +101,9 @@ HELPS: dict[str, dict[str, Arm]] = {
         "action-steer": {"maze.actions": "steer"},
     },
     "q": {
-        "no-replay": {"q.replays": 0},
-        "replays-times-0.2": {"q.replays": 20},
+        "no-replay": {"q.replays": 0, "q.replay_every": 0},
+        "replay-each-trial": {"q.replays": 100, "q.replay_every": 0},
+        "replay-each-decision": {"q.replays": 0, "q.replay_every": 1},
         "no-optimism": {"q.initial": 0.0},
         "goal-as-optimism": {"q.initial": 100.0},
         "no-optimism-step-cost": {"q.initial": 0.0, "maze.step_reward": -1.0},
