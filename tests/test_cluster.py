@@ -32,9 +32,9 @@ SEEDS = range(3)
 TRIALS = 12
 FLAGS = (  # those of `config` and `quick_options`
     "--agent q --network fixed --net.grid 4 4 4 --maze.max-steps 5000 --q.replays 0 "
-    "--q.replay-every 0 "
-    "--quiet --checkpoint-every 2 --picture-every 0 --video-every 0"
+    "--q.replay-every 0 --quiet --checkpoint-every 2 --picture-every 0 --video-every 0"
 )
+NO_REPLAY = {"replays": 0, "replay_every": 0}
 LIGHT = f"""
 import os, sys
 def work(path, arguments, after):
@@ -224,9 +224,7 @@ def disk(request, monkeypatch):
 
 
 def config(trials):
-    return short(
-        "q", "fixed", trials=trials, maze={"max_steps": 5000}, q={"replays": 0, "replay_every": 0}
-    )
+    return short("q", "fixed", trials=trials, maze={"max_steps": 5000}, q=NO_REPLAY)
 
 
 @pytest.fixture(scope="module")

@@ -174,9 +174,18 @@ def test_the_last_trial_is_played_again_to_the_bit(tmp_path):
     assert len(path.true) == record.decisions + 1
 
 
+ABORTS = """
+import os
+def work(path, *_):
+    path.mkdir()
+    if path.name == "b":
+        os.abort()
+    (path / "evaluation.json").write_text('{"diverged": "numbers"}')
+"""
+
+
 def test_a_crash_is_reported_and_the_others_finish(tmp_path, monkeypatch, capsys):
-    script = "import os\nDIVERGED = '{\"diverged\": 1}'\ndef work(path, *_):\n path.mkdir()\n if path.name == 'b': os.abort()\n"
-    (tmp_path / "aborts.py").write_text(f"{script} (path / 'evaluation.json').write_text(DIVERGED)")
+    (tmp_path / "aborts.py").write_text(ABORTS)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(running, "WORK", "aborts:work")
     jobs = [job(tmp_path, name) for name in "abc"]
