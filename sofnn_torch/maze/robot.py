@@ -57,8 +57,7 @@ class Physics:
             self._left_wheel = self.model.joint("wheel_left").qposadr.item()
             self._right_wheel = self.model.joint("wheel_right").qposadr.item()
             self._floor = self.model.geom("floor").id
-            for name in INFRARED:
-                self.model.sensor(name)
+            self._infrared = [self.model.sensor(name).adr.item() for name in INFRARED]
         except KeyError as error:
             what = str(error.args[0]).split(". Valid")[0]
             raise ValueError(f"the model lacks an element of the standard maze: {what}") from error
@@ -66,11 +65,13 @@ class Physics:
         self.place(self.plan.start)
 
     def _look_at_data(self) -> None:
-        self._qpos, self._ctrl = self.data.qpos, self.data.ctrl
+        data = self.data
+        self._qpos, self._ctrl, self._sensors = data.qpos, data.ctrl, data.sensordata
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what a copy or a pickle takes along; its views will be of its own data."""
-        return {name: self.__dict__[name] for name in self.__dict__.keys() - {"_qpos", "_ctrl"}}
+        views = {"_qpos", "_ctrl", "_sensors"}
+        return {name: self.__dict__[name] for name in self.__dict__.keys() - views}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Become a copy."""
@@ -137,7 +138,7 @@ class Physics:
         mujoco.mj_kinematics(self.model, self.data)
         mujoco.mj_sensorPos(self.model, self.data)
         options.disableflags |= mujoco.mjtDisableBit.mjDSBL_SENSOR
-        ranges = (self.data.sensor(name).data.item() for name in INFRARED)
+        ranges = self._sensors[self._infrared].tolist()
         return [min(r, INFRARED_RANGE) if r >= 0.0 else INFRARED_RANGE for r in ranges]
 
     def state(self) -> list[float]:
