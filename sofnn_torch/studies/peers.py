@@ -49,6 +49,7 @@ TITLES = {
     "ppo": "PPO, Stable-Baselines3",
 }
 OURS = ("sga", "q")
+COUNTS = ("seeds", "tries", "trials", "decisions", "max_steps")  # options of a measurement
 FIRST = 1000  # seed of the first try of a search
 PLAYED = 20  # greedy trials after learning
 TILES: dict[str, tuple[Any, ...]] = {
@@ -96,6 +97,8 @@ class Options(Settings):
     """Trials of a run."""
     decisions: Count = 300_000
     """Decisions after which a run ends, at the end of its trial."""
+    max_steps: Count = 20_000
+    """Steps after which a trial ends."""
     out: Path = Path("docs/results")
     """Where data and page go; learners that are not asked for stay there."""
     report_only: bool = False
@@ -139,9 +142,11 @@ def learn(
         options: trials and decisions.
         enough: stop as soon as it has learned.
     """
-    config = Config(agent="sga" if learner != "q" else "q", seed=seed)
-    maze = dataclasses.replace(config.maze, actions="three")
-    env: Any = make_env(config if learner in OURS else dataclasses.replace(config, maze=maze))
+    config = Config(agent="q" if learner == "q" else "sga", seed=seed)
+    actions = config.maze.actions if learner in OURS else "three"
+    maze = dataclasses.replace(config.maze, actions=actions, max_steps=options.max_steps)
+    config = dataclasses.replace(config, maze=maze)
+    env: Any = make_env(config)
     begin = time.process_time()
     trials: list[Trial] = []
 
@@ -313,11 +318,9 @@ def run(options: Options) -> int:
 def command(learner: str, options: Options) -> str:
     """The command that measures a learner."""
     given, usual = vars(options), vars(Options())
-    names = [
-        name for name in ("seeds", "tries", "trials", "decisions") if given[name] != usual[name]
-    ]
-    words = [f"--learners {learner}", *(f"--{name} {given[name]}" for name in names)]
-    return " ".join(["python -m sofnn_torch.studies.peers", *words])
+    changed = [name for name in COUNTS if given[name] != usual[name]]
+    flags = [f"--{name.replace('_', '-')} {given[name]}" for name in changed]
+    return " ".join([f"python -m sofnn_torch.studies.peers --learners {learner}", *flags])
 
 
 def main() -> None:
