@@ -15,6 +15,13 @@ GOOD, BAD = Trial(480, 50, True, 0.0), Trial(20_000, 2_000, False, 0.0)
 SHORT = {"before": 1, "during": 1, "after": 1, "max_steps": 60, "workers": 1}
 
 
+@pytest.fixture(autouse=True)
+def quick(monkeypatch):
+    """Without the search for the optimum, and few greedy trials."""
+    monkeypatch.setattr(change, "optimum", lambda layout: 468.0)
+    monkeypatch.setattr(change, "PLAYED", 2)
+
+
 def test_each_change_is_of_the_world_and_of_nothing_else():
     config = Config(agent="q")
     before = plan_of("s")

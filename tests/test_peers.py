@@ -12,6 +12,12 @@ from sofnn_torch.studies.results import read_table
 GOOD, BAD = Trial(500, 60, True, 0.0), Trial(20_000, 2_000, False, 0.0)
 
 
+@pytest.fixture(autouse=True)
+def quick(monkeypatch):
+    """Without the search for the optimum."""
+    monkeypatch.setattr(peers, "_optimum", lambda: 468.0)
+
+
 def test_a_run_has_learned_after_ten_good_trials_in_a_row():
     assert math.isnan(peers.learned([GOOD] * 9 + [BAD] + [GOOD] * 9))
     assert peers.learned([BAD, GOOD, BAD] + [GOOD] * 12) == 13
