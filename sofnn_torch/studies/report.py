@@ -239,6 +239,10 @@ def write(out: Path) -> int:
         "anything.\n\n"
     )
     text += markdown(["study", "arms", "seeds of an arm", "command"], index, 4)
+    more = [path for name in ("peers", "change") if (path := out / f"{name}.md").exists()]
+    if more:
+        titles = (f"[{path.read_text().splitlines()[0][2:]}]({path.name})" for path in more)
+        text += f"\n\nMade by commands of their own: {', '.join(titles)}."
     (out / "README.md").write_text(text + "\n")
     say(f"written: {out}/README.md and the pages of {', '.join(names)}")
     return 0
