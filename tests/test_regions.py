@@ -99,6 +99,42 @@ def test_no_proof_is_false_and_every_example_is_true(kind, settings):
     assert proved > 6 and shown >= 12
 
 
+def steering(rules=80, seed=0):
+    """SGA whose action is a vector of two numbers."""
+    task, generator = Task(AXES, ("speed", "turn"), False), torch.Generator().manual_seed(seed)
+    net = SOFNN(AXES, len(SGA.layout(SGAConfig(), task)[1]), width=[0.15, 0.15, 0.6])
+    for _ in range(rules):
+        net.add_rule(torch.rand(3, generator=generator) * torch.tensor([1.0, 1.0, 2 * math.pi]))
+    net.consequents[:, :2].uniform_(-1, 1, generator=generator)
+    return SGA(net, task, SGAConfig())
+
+
+def test_no_action_leaves_the_ends_that_were_proved_and_they_are_close():
+    rng, agent = np.random.default_rng(4), steering()
+    for _ in range(6):
+        low = rng.uniform([0, 0, -3], [0.9, 0.9, 3])
+        high = low + [0.08, 0.08, 0.4]
+        actions = agent.plan(sampled(rng, low, high, 5000)).actions
+        for i, found in enumerate(regions.ranges_within(agent, low, high)):
+            least, greatest = actions[:, i].min(), actions[:, i].max()
+            assert found.low <= min(least, found.least)
+            assert found.high >= max(greatest, found.greatest)
+            assert found.high - found.greatest < 0.03 and found.least - found.low < 0.03
+            assert found.least < least + 0.02 and found.greatest > greatest - 0.02
+
+
+def test_a_search_for_ends_that_is_given_up_has_wider_ones_but_no_wrong_ones():
+    agent, (low, high) = steering(), ([0, 0, 0], [1, 1, 6])
+    wide, narrow = (regions.ranges_within(agent, low, high, most)[0] for most in (1, 5000))
+    assert -1 <= wide.low <= narrow.low < narrow.least < narrow.greatest < narrow.high <= wide.high
+
+
+def test_ranges_are_for_vectors_and_choices_for_the_rest():
+    for ask, agent in ((regions.ranges_within, learner(SGA)), (regions.actions_within, steering())):
+        with pytest.raises(ValueError, match=r"vectors|discrete actions"):
+            ask(agent, [0, 0, 0], [1, 1, 1])
+
+
 @pytest.mark.slow
 def test_a_million_states_contradict_no_proof():
     rng, agent, proofs = np.random.default_rng(3), learner(SGA, 200), 0

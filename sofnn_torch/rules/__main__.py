@@ -37,7 +37,7 @@ from sofnn_torch.pictures import figures, spots
 from sofnn_torch.rules import checks, lab, new, played, tables, terms, why, words
 from sofnn_torch.rules.editing import edited
 from sofnn_torch.rules.reducing import reduce_run
-from sofnn_torch.rules.regions import actions_within
+from sofnn_torch.rules.regions import actions_within, ranges_within
 from sofnn_torch.rules.words import Reading
 from sofnn_torch.runs import checkpoint, rule_files
 from sofnn_torch.runs.factory import make_plan
@@ -284,8 +284,11 @@ def run(options: Options) -> None:
         print(f"firing strength of the strongest rule: {decision.strongest:.2g}")
         return
     if options.within:
-        answers = actions_within(agent, *region_of(options, config))
-        tables.show(tables.region_table(answers, config.task.axes))
+        region = region_of(options, config)
+        if agent.choices:
+            tables.show(tables.region_table(actions_within(agent, *region), config.task.axes))
+        else:
+            tables.show(tables.range_table(ranges_within(agent, *region)))
         return
     shares, trial = firing_along_a_trial(config, agent, options.seed)
     decisions, outcome = trial.record.decisions, played.outcome(trial.record)

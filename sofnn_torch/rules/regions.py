@@ -1,4 +1,4 @@
-"""What a policy can do anywhere in a region: every action proved impossible there, or shown.
+"""What a policy can do anywhere in a region: actions proved impossible there, or shown.
 
 An output is a mean of consequents, weighted by firing strengths (eqs 4 and 10). In a box of states
 each firing strength lies between two values that follow from the distances of the box to the rule's
@@ -7,7 +7,8 @@ the rules with consequents above some switch point fire as strongly, and the oth
 they can; trying all switch points finds it (Karnik and Mendel, Centroid of a type-2 fuzzy set,
 Information Sciences 132, 2001). In truth strengths do not vary independently, so this bound is
 safe, not tight. Boxes that it does not decide are halved, and the states in their middles are
-looked at for an example.
+looked at for an example. Where the action is a vector, each of its numbers gets ends that it never
+passes, by the same bound.
 """
 
 import itertools
@@ -26,6 +27,7 @@ Array = NDArray[np.float64]
 
 BATCH = 64  # boxes at a time
 MOST = 100_000  # boxes until the search is given up
+CLOSE = 0.01  # of the range of a number of the action: ends so close to an example are good enough
 MARGIN = 1e-3  # of the span of the consequents: more than single precision errs
 
 
@@ -43,6 +45,25 @@ class Answer:
     action: str
     possible: bool | None
     example: Array | None = None
+
+
+@dataclass(frozen=True)
+class Range:
+    """What a number of the action can be anywhere in a region.
+
+    Attributes:
+        name: of the number.
+        low: it is proved to be nowhere below.
+        least: the least at a state that was looked at.
+        greatest: the greatest at one.
+        high: it is proved to be nowhere above.
+    """
+
+    name: str
+    low: float
+    least: float
+    greatest: float
+    high: float
 
 
 def strengths(
@@ -108,17 +129,9 @@ def actions_within(
     Raises:
         ValueError: a box that is none, or a learner of which this cannot be told.
     """
-    axes = agent.task.axes
     rivals = _rivals(agent)
-    lows, highs = np.array([low], float), np.array([high], float)
-    if lows.shape != (1, len(axes)) or highs.shape != lows.shape:
-        raise ValueError(f"a region needs two ends for each of {len(axes)} inputs")
-    if not (np.isfinite(lows).all() and np.isfinite(highs).all() and (lows <= highs).all()):
-        raise ValueError("the ends of a region are finite, the lower one first")
-    for axis, a, b in zip(axes, lows[0], highs[0], strict=True):
-        if axis.period and b - a > axis.period * (1 + 1e-6):
-            raise ValueError(f"a region spans at most a whole turn of {axis.name}")
-    net = agent.net
+    lows, highs = _box(agent.task.axes, low, high)
+    axes, net = agent.task.axes, agent.net
     centres, widths = net.centres.double().numpy(), net.widths.double().numpy()
     examples: list[Array | None] = [None] * len(agent.choices)
     looked = 0
@@ -131,17 +144,92 @@ def actions_within(
         for j, differences in enumerate(rivals):
             if examples[j] is None:
                 open_ |= _may_win(*bounds, differences)
-        a, b = a[open_], b[open_]
-        side = ((b - a) / np.median(widths, 0)).argmax(1)
-        rows, middle = np.arange(len(a)), 0.5 * (a + b)
-        left, right = b.copy(), a.copy()
-        left[rows, side] = right[rows, side] = middle[rows, side]
-        lows, highs = np.concatenate([lows, a, right]), np.concatenate([highs, left, b])
+        a, b = _halves(a[open_], b[open_], widths)
+        lows, highs = np.concatenate([lows, a]), np.concatenate([highs, b])
     undecided = _still_open(lows, highs, (centres, widths, axes), rivals)
     return [
         Answer(name, True if found is not None else None if undecided[j] else False, found)
         for j, (name, found) in enumerate(zip(agent.choices, examples, strict=True))
     ]
+
+
+def ranges_within(
+    agent: Learner, low: Sequence[float], high: Sequence[float], most: int = MOST
+) -> list[Range]:
+    """Between which ends each number of the action lies anywhere in a box, without exploration.
+
+    Args:
+        agent: a learner whose action is the mean of outputs of the network.
+        low: lower end of each input of the state. Shape: (n,).
+        high: upper end, for an input that wraps at most a period above. Shape: (n,).
+        most: boxes to look at for each end before the bound found so far is taken.
+
+    Raises:
+        ValueError: a box that is none, or a learner of which this cannot be told.
+    """
+    if agent.choices or agent.decoding().get("kind") != "normal":
+        raise ValueError("ranges are for actions that are vectors of means")
+    box, found = _box(agent.task.axes, low, high), []
+    for i, name in enumerate(agent.task.actions):
+        least, below = _greatest(agent, box, i, -1.0, most)
+        greatest, above = _greatest(agent, box, i, 1.0, most)
+        found.append(Range(name, max(-below, -1.0), -least, greatest, min(above, 1.0)))
+    return found
+
+
+def _greatest(
+    agent: Learner, box: tuple[Array, Array], number: int, sign: float, most: int
+) -> tuple[float, float]:
+    """The greatest that a number of the action, times a sign, was in a box, and a bound of all.
+
+    Of all boxes those with the greatest bounds are looked at and halved first.
+    """
+    net, axes, (lows, highs) = agent.net, agent.task.axes, box
+    centres, widths = net.centres.double().numpy(), net.widths.double().numpy()
+    values = sign * net.consequents[:, number].double().numpy()
+    margin, seen, looked = MARGIN * float(np.ptp(values)), -math.inf, 0
+    bounds = greatest_mean(*strengths(lows, highs, centres, widths, axes), values)
+    while looked < most:
+        middles = (0.5 * (lows + highs))[np.argsort(-bounds)[:BATCH]].astype(np.float32)
+        seen = max(seen, float((sign * agent.plan(middles).actions[:, number]).max()))
+        open_ = bounds > seen + 2 * CLOSE
+        if not open_.any():
+            break
+        lows, highs, bounds = lows[open_], highs[open_], bounds[open_]
+        order = np.argsort(-bounds)
+        first, rest = order[:BATCH], order[BATCH:]
+        looked += len(first)
+        a, b = _halves(lows[first], highs[first], widths)
+        fresh = greatest_mean(*strengths(a, b, centres, widths, axes), values)
+        lows, highs = np.concatenate([lows[rest], a]), np.concatenate([highs[rest], b])
+        bounds = np.concatenate([bounds[rest], fresh])
+    return seen, float(max(bounds.max(initial=-math.inf), seen)) + margin
+
+
+def _halves(lows: Array, highs: Array, widths: Array) -> tuple[Array, Array]:
+    """Boxes (B, n), halved across the side that is longest beside the rules. Shape: (2B, n)."""
+    side = ((highs - lows) / np.median(widths, 0)).argmax(1)
+    rows, middle = np.arange(len(lows)), 0.5 * (lows + highs)
+    left, right = highs.copy(), lows.copy()
+    left[rows, side] = right[rows, side] = middle[rows, side]
+    return np.concatenate([lows, right]), np.concatenate([left, highs])
+
+
+def _box(axes: Sequence[Axis], low: Sequence[float], high: Sequence[float]) -> tuple[Array, Array]:
+    """A region as a box each of lower and of upper ends. Shape: (1, n).
+
+    Raises:
+        ValueError: it is none.
+    """
+    lows, highs = np.array([low], float), np.array([high], float)
+    if lows.shape != (1, len(axes)) or highs.shape != lows.shape:
+        raise ValueError(f"a region needs two ends for each of {len(axes)} inputs")
+    if not (np.isfinite(lows).all() and np.isfinite(highs).all() and (lows <= highs).all()):
+        raise ValueError("the ends of a region are finite, the lower one first")
+    for axis, a, b in zip(axes, lows[0], highs[0], strict=True):
+        if axis.period and b - a > axis.period * (1 + 1e-6):
+            raise ValueError(f"a region spans at most a whole turn of {axis.name}")
+    return lows, highs
 
 
 def _look(agent: Learner, states: Array, examples: list[Array | None]) -> None:

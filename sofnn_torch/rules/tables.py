@@ -12,7 +12,7 @@ from rich.table import Table
 
 from sofnn_torch.network.axes import Axis
 from sofnn_torch.rules import words
-from sofnn_torch.rules.regions import Answer
+from sofnn_torch.rules.regions import Answer, Range
 from sofnn_torch.rules.words import Decision, Reading, number
 from sofnn_torch.terminal import plural
 
@@ -128,6 +128,15 @@ def region_table(answers: Sequence[Answer], axes: Sequence[Axis]) -> Table:
         found = answer.example
         place = "" if found is None else ", ".join(map(words.at, axes, found.tolist()))
         view.add_row(answer.action, said[answer.possible], place)
+    return view
+
+
+def range_table(ranges: Sequence[Range]) -> Table:
+    """Between which ends a policy's action lies in a region."""
+    view = Table("number", "never below", "seen", "never above", box=SIMPLE_HEAD, pad_edge=False)
+    for found in ranges:
+        seen = f"{found.least:+.3f} to {found.greatest:+.3f}"
+        view.add_row(found.name, f"{found.low:+.3f}", seen, f"{found.high:+.3f}")
     return view
 
 
