@@ -205,6 +205,40 @@ def test_each_column_of_the_main_table_is_what_its_head_says():
     }
 
 
+def table_of(text):
+    """The last line of a table in Markdown by its heads."""
+    head, *_, row = ([c.strip() for c in line.split("|")[1:-1]] for line in text.splitlines())
+    return dict(zip(head, row, strict=True))
+
+
+def test_where_the_plain_policy_was_played_the_main_table_has_it_beside_the_greedy_one():
+    plain = {"plain_success": 0.8, "plain_steps": 900, "trials_freed": 7}
+    found = table_of(report.arm_table(study({"q-x": plain}), ["q-x"]))
+    assert found["success, plain [%]"] == "80.0 (76.2 to 83.4)"
+    assert (found["steps, plain"], found["trials freed"]) == ("900", "35 of 500")
+    assert found["steps, greedy"] == "500"
+
+
+@pytest.mark.parametrize(("alone", "reached"), [(1.0, "yes"), (0.9, "no")])
+def test_the_plain_policy_has_a_goal_of_its_own(alone, reached):
+    data = study({"q-sofnn-estimated": {"plain_success": alone, "plain_steps": 500}})
+    (last,) = [yes for _, goal, _, yes in claims.goals(data) if "plain" in goal]
+    assert last == reached
+
+
+def test_what_learning_took_is_tabled_arm_by_arm():
+    took = {"steps_to_learn": 80_000, "decisions_to_learn": 9_000, "replayed_to_learn": 64_000}
+    found = table_of(report.learning_table(study({"q-x": took | {"cpu_seconds": 99}})))
+    assert found == {
+        "arm": "q-x",
+        "trials": "20",
+        "steps of the environment": "80,000",
+        "decisions taken": "9,000",
+        "decisions replayed": "64,000",
+        "processor time of a whole run [s]": "99",
+    }
+
+
 def condition(seed, policy, success, steps):
     key = {"arm": "q-sofnn-estimated", "seed": seed, "group": "motor noise [%]", "value": 10.0}
     return key | {"policy": policy, "success": success, "steps": steps, "collisions": 0}
