@@ -79,6 +79,26 @@ def chosen(agent, command, x):
     return torch.cat([x, code, torch.ones(1).double()]), state
 
 
+@pytest.mark.parametrize("coding", ["scalar", "antecedent"])
+def test_the_number_that_is_drawn_in_a_segment_is_learned_from_where_three_can_be_done(coding):
+    agent, drawn = learner(coding, temperature=1e6), []
+    for _ in range(60):
+        segment = agent.start(np.zeros(3))
+        number = agent.decision[3]
+        low, high = agent.edges[segment]
+        assert low <= number <= high
+        drawn.append(number)
+    assert len(set(drawn)) == 60 and min(drawn) < -0.9 and max(drawn) > 0.9
+
+
+def test_rules_that_hold_an_action_grow_where_it_was_drawn():
+    agent = learner("antecedent", rules=0, temperature=1e6)
+    for _ in range(20):
+        agent.start(np.zeros(3))
+    places = agent.net.centres[:, 3].sort().values
+    assert len(places) >= 3 and not set(places.tolist()) & {-1.0, 1.0}
+
+
 @settings(max_examples=80, deadline=None)
 @given(
     seed=st.integers(0, 10_000),

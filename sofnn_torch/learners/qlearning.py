@@ -260,8 +260,9 @@ class QLearning(Learner):
         values = self.action_values(x, firing).tolist()
         segment, inside = self._draw(values)
         scalar = self.representatives[segment] if self.task.discrete else inside
-        # The paper draws the action inside the segment also where the robot only has three.
-        code = self._code(segment, inside if self.coding == "scalar" else scalar)
+        # The paper draws the action inside the segment also where the robot only has three (step
+        # 4.3): rules are about the number that was drawn.
+        code = self._code(segment, inside if self.coding in ("scalar", "antecedent") else scalar)
         self.decision = [*x.tolist(), *code, 1.0]
         features = x.new_tensor(self.decision)
         if self.coding == "antecedent":
