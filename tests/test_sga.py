@@ -136,6 +136,21 @@ def test_one_step_follows_equations_7_and_8(factor, terminated):
     torch.testing.assert_close(agent.net.table().detach(), before + alpha * 0.75 * traces)
 
 
+def test_rates_are_meant_for_an_action_in_its_own_unit():
+    settings = {"rate_mean": 5e-4, "rate_deviation": 2e-4, "variance_scaled": False}
+    agent = learner(rules=1, baseline="constant", action_range=0.1, sigma_max=9, **settings)
+    agent.net.consequents[0] = torch.tensor([0.2, 0.5])
+    agent.start(agent.net.centres[0].numpy().copy())
+    # By hand: an action from -0.1 to 0.1, of mean 0.02 and deviation 0.05.
+    noise, mean, deviation = np.random.default_rng(0).standard_normal(), 0.02, 0.05
+    action = mean + deviation * noise
+    mean += 5e-4 * (action - mean) / deviation**2
+    deviation += 2e-4 * ((action - 0.02) ** 2 - 0.05**2) / 0.05**3
+    agent.step(1.0, np.zeros(3), True)
+    expected = torch.tensor([[mean, deviation]]).double() / 0.1
+    torch.testing.assert_close(agent.net.consequents, expected)
+
+
 def test_value_baseline_learns_by_the_td_error():
     agent = learner(gamma=0.9, rate_value=0.5)
     x, following = np.array([0.1, 0.2, 0.3]), np.array([0.4, -0.2, 0.8])

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from sofnn_torch import Config, evaluate, terminal
 from sofnn_torch.cli import parse
-from sofnn_torch.runs import checkpoint
+from sofnn_torch.runs import checkpoint, preset_files
 from sofnn_torch.runs.session import RunOptions
 from sofnn_torch.sweep import __main__ as sweep
 from sofnn_torch.sweep import space, tries
@@ -145,6 +145,15 @@ def test_every_learner_has_a_space_whose_ends_are_settings(agent, network, env):
     entries = {"agent": agent, "network": network, "env": env}
     found = space.ranges(space.built_in(Config(**entries)), entries, "built in")
     assert len(found) >= 5 and all(range_.low < range_.high for range_ in found.values())
+
+
+@pytest.mark.parametrize("agent", ["sga", "q"])
+def test_the_search_for_what_the_paper_does_not_print_leaves_what_it_prints(agent):
+    file = Path(__file__).parents[1] / f"benchmarks/completed_{agent}.toml"
+    found = space.ranges(preset_files.read(file), {"agent": agent, "preset": "paper"}, file.name)
+    printed = {"sga.rate_mean", "sga.rate_deviation", "sga.gamma", "q.temperature", "q.gamma"}
+    printed |= {"q.rate_state", "q.rate_action", "q.rate_constant", "maze.goal_reward", "trials"}
+    assert len(found) >= 8 and not printed & found.keys()
 
 
 @given(st.floats(1e-6, 1e3), st.floats(1.01, 100), st.booleans(), st.integers(0, 9))

@@ -54,6 +54,9 @@ class SGAConfig(Settings, table="sga"):
     """Learning rate of the consequents mu."""
     rate_deviation: PolicyRate = 10.0
     """Learning rate of the consequents sigma."""
+    action_range: Positive = 1.0
+    """Greatest action in the unit for which the rates of mu and sigma are meant; their steps grow
+    with 1 / its square. Mu, sigma and their bounds are shares of it. The paper prints no range."""
     rate_centre: NotNegative = 0.0
     """Learning rate of the centres u; 0 leaves them where they were put."""
     rate_width: NotNegative = 0.0
@@ -149,7 +152,9 @@ class SGA(Learner):
         self.value_limit = math.inf if settings.value_limit is None else settings.value_limit
         self.antecedents = settings.rate_centre > 0 or settings.rate_width > 0
         scale = 1 - settings.gamma if settings.one_minus_gamma else 1.0
-        rates = [settings.rate_mean * scale] * m + [settings.rate_deviation * scale] * m
+        # d/d(s mu) is 1/s d/d mu, and a step of s mu one of mu over s.
+        share = scale / settings.action_range**2
+        rates = [settings.rate_mean * share] * m + [settings.rate_deviation * share] * m
         rates += [settings.rate_value] * learned
         if self.antecedents:
             n = net.n_inputs
