@@ -14,6 +14,7 @@ import compiled
 import learning
 import neighbours
 import reduce
+import tasks
 import training
 
 from sofnn_torch.maze.settings import POSE
@@ -116,3 +117,50 @@ def test_small_rule_bases_are_compared_with_the_full_one_of_their_seed():
     *_, full, small = reduce.table(rows).splitlines()
     assert full == "| maze, SGA | 700 | 100.00% | 0 of 2 |  | 0 |  |"
     assert small == "| maze, SGA | 20 | 99.50% | 1 of 2 | +6.0%, +10.0% | 0 | 50.0%, 75.0% |"
+
+
+def test_tasks_are_measured_to_their_steps_with_replay_and_without(tmp_path, monkeypatch, capsys):
+    out, runs = tmp_path / "tasks.json", tmp_path / "runs"
+    flags = ["--env", "CartPole-v1", "--seeds", "2", "--steps", "60", "--runs", str(runs)]
+    monkeypatch.setattr(sys, "argv", ["tasks.py", *flags, "--out", str(out)])
+    monkeypatch.setattr(tasks, "EPISODES", 2)
+    tasks.main()
+    cells = json.loads(out.read_text())
+    assert [cell["replay"] for cell in cells] == ["with", "without"]
+    assert all(60 <= seed["steps"] < 560 for cell in cells for seed in cell["seeds"])
+    # Before the second trial there is nothing to replay: both arms begin alike.
+    first = [run.read_text().splitlines()[:2] for run in sorted(runs.glob("*/trials.csv"))]
+    assert first[0] == first[2] != first[1] == first[3]
+    printed = capsys.readouterr().out
+    monkeypatch.setattr(tasks, "train", None)  # what is there is not trained again
+    tasks.main()
+    monkeypatch.setattr(sys, "argv", ["tasks.py", "--table", str(out)])
+    tasks.main()
+    table = capsys.readouterr().out.splitlines()[-4:]
+    assert table == printed.splitlines()[-4:]
+    assert len(table[0].split("|")) == len(table[2].split("|"))
+
+
+def test_a_row_has_an_interval_from_five_seeds_on():
+    def line(count):
+        seeds = [
+            {"seed": s, "steps": 1, "rules": 4 + s, "seconds": 1.0, "return": float(s)}
+            for s in range(count)
+        ]
+        cell = {"env": "CartPole-v1", "agent": "q", "replay": "with", "steps": 1_000}
+        return tasks.row(cell | {"seeds": seeds})
+
+    assert "| 1,000 | 4 | 1.5 | - | 0.0 | 4-7 |" in line(4)
+    assert "| 1,000 | 5 | 2.0 | - |" not in line(5) and "| 5 | 2.0 |" in line(5)
+
+
+def test_rows_that_are_not_measured_again_stay(tmp_path):
+    def cell(env, replay, reward):
+        seeds = [{"return": reward}]
+        return {"env": env, "agent": "q", "replay": replay, "steps": 9, "seeds": seeds}
+
+    out = tmp_path / "tasks.json"
+    out.write_text(json.dumps([cell("CartPole-v1", "with", 1), cell("Other-v0", "with", 2)]))
+    new = [cell("CartPole-v1", "with", 3), cell("MountainCar-v0", "without", 4)]
+    returns = [c["seeds"][0]["return"] for c in tasks.merged(new, out)]
+    assert returns == [4, 3, 2]

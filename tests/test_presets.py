@@ -1,15 +1,19 @@
 """The preset ``paper`` is the paper, and learners are made as the settings say."""
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
 from conftest import settings
 
+from sofnn_torch.runs import presets
 from sofnn_torch.runs.directory import flatten
 from sofnn_torch.runs.factory import make_agent
 from sofnn_torch.runs.settings import Config, MazeConfig, from_dict
+from sofnn_torch.tasks.env import Spaces, look
+from sofnn_torch.tasks.known import TUNED
 
 # Section 5, as printed; a decay of 1 is equation 6, of 0 are equations 12-15.
 PRINTED = {
@@ -140,3 +144,24 @@ def test_a_run_from_before_the_infrared_sensors_is_told_what_it_was_told(old, ne
 def test_whole_numbers_beyond_all_floats_are_refused():
     with pytest.raises(ValueError, match=r"--maze.goal-reward must be a finite number"):
         MazeConfig(goal_reward=10**400)
+
+
+def test_what_was_found_for_a_known_task_is_taken_by_q_learning_alone():
+    tuned = {"net": {"width": (0.03,)}, "q": {"gamma": 0.9}}
+    usual = Spaces(look("MountainCar-v0").axes, ("left", "right"), discrete=True)
+    known = replace(usual, tuned=tuned)
+    for agent, network in [("q", "sofnn"), ("q", "fixed"), ("sga", "sofnn"), ("sga", "fixed")]:
+        before, after = (presets.task_tables(agent, network, found) for found in (usual, known))
+        assert after["q"] == replace(before["q"], gamma=0.9)
+        assert after["sga"] == before["sga"]
+        growing = (agent, network) == ("q", "sofnn")  # a grid has its own widths
+        assert after["net"] == (replace(before["net"], width=(0.03,)) if growing else before["net"])
+
+
+@pytest.mark.parametrize("name", sorted(TUNED))
+def test_what_was_found_for_a_known_task_is_a_setting_of_it(name):
+    env = next(spec.id for spec in gymnasium.registry.values() if spec.name == name)
+    config = Config(env=env, agent="q")
+    for table, values in TUNED[name].items():
+        part = getattr(config, table)
+        assert {k: getattr(part, k) for k in values} == dict(values)

@@ -222,6 +222,16 @@ def test_actions_are_uniform_inside_their_segment(learns):
     assert stats.kstest(sample, "uniform", args=(-1, 2)).pvalue > 1e-3
 
 
+@pytest.mark.parametrize("learns", [True, False])
+def test_points_are_the_actions_themselves_from_end_to_end(learns):
+    agent = learner(actions="steer", segments=5, points=True, temperature=1e9)
+    decide = agent.start if learns else lambda x: agent.act(x, explore=1)
+    assert {float(decide(np.zeros(3))[0]) for _ in range(200)} == {-1.0, -0.5, 0.0, 0.5, 1.0}
+    assert agent.choices == ("-1.00", "-0.50", "+0.00", "+0.50", "+1.00")
+    best = np.float32(agent.representatives)[agent.plan(np.zeros((1, 3))).choice]
+    assert agent.act(np.zeros(3)) == best
+
+
 def test_a_scalar_action_is_drawn_inside_its_segment_also_for_three_actions():
     agent, sample = learner("scalar", temperature=1e9), []
     for _ in range(1000):

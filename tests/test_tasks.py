@@ -185,6 +185,7 @@ def test_what_is_not_supported_is_one_line(spaces, said, toy, tmp_path, capsys):
         ("--env MountainCar-v0 --pose true", "--pose has no effect with --env MountainCar-v0"),
         ("--env MountainCar-v0 --net.width-heading 1", "--net.width-heading has no effect"),
         ("--env MountainCar-v0 --agent q --q.segments 9", "--q.segments has no effect"),
+        ("--env MountainCar-v0 --agent q --q.points", "--q.points has no effect"),
         ("--net.width 0.3", "--net.width has no effect with --env maze"),
         ("--axes a m 0 1 0", "--axes has no effect with --env maze"),
         ("--reward-scale 2", "--reward-scale has no effect with --env maze"),

@@ -49,6 +49,9 @@ class QConfig(Settings, table="q"):
     action also enters the rules' antecedents: the paper's fuzzy net - a)."""
     segments: Annotated[int, Within(above=0), Within(most=1_000)] = 3
     """Number J of segments of a continuous range; of discrete actions J is their number."""
+    points: bool = False
+    """Actions in a continuous range are J points from one end to the other, instead of drawn in
+    segments."""
     temperature: Positive = 0.05
     """Temperature T of the Boltzmann roulette, eq. 11."""
     gamma: Share = 0.99
@@ -133,10 +136,12 @@ class QLearning(Learner):
         ends = [-1 + 2 * j / segments for j in range(segments + 1)]
         self.edges = list(pairwise(ends))
         middles = [(low + high) / 2 for low, high in self.edges]
-        # Discrete actions begin and end at the ends of the range themselves.
+        # Discrete actions and points begin and end at the ends of the range themselves.
         spread = [2 * j / max(segments - 1, 1) - 1.0 for j in range(segments)]
-        self.representatives = spread if task.discrete else middles
-        self.choices = self.choices or tuple(f"{a:+.2f}" for a in middles)
+        self.representatives = spread if task.discrete or settings.points else middles
+        if settings.points and not task.discrete:  # nothing is left to draw in a segment
+            self.edges = [(a, a) for a in spread]
+        self.choices = self.choices or tuple(f"{a:+.2f}" for a in self.representatives)
         codes = [self._code(j, a) for j, a in enumerate(self.representatives)]
         self.codes = self.rates.new_tensor(codes)  # (J, length)
         self.tails = torch.cat([self.codes, self.codes.new_ones(segments, 1)], 1)

@@ -26,11 +26,12 @@ def task_tables(agent: str, network: str, found: Spaces) -> dict[str, Any]:
     """The tables of the preset ``default`` for a task with these spaces.
 
     The square of a distance grows with the number of inputs, and so do the squares of the widths
-    beyond two inputs. A grid has about a thousand rules and widths of half its spacing.
+    beyond two inputs. A grid has about a thousand rules and widths of half its spacing. What a
+    search found for a known task comes last (`sofnn_torch.tasks.known`).
     """
     inputs = len(found.axes)
     along = max(2, int(1000 ** (1 / inputs) + 1e-9))
-    sharpness = (found.sharpness or 0.07) if agent == "q" else 0.1  # greedy values need sharp sets
+    sharpness = 0.07 if agent == "q" else 0.1  # greedy values need sharp sets
     width = sharpness * max(1.0, math.sqrt(inputs / 2)) if network == "sofnn" else 0.5 / along
     net = NetworkConfig(
         theta=0.3 if agent == "q" else 0.4, width=(float(f"{width:.3g}"),), grid=(along,)
@@ -54,6 +55,9 @@ def task_tables(agent: str, network: str, found: Spaces) -> dict[str, Any]:
         replays=20,
         replay_every=0,
     )
+    q = replace(q, **found.tuned.get("q", {}))
+    if agent == "q" and network == "sofnn":
+        net = replace(net, **found.tuned.get("net", {}))
     return {"net": net, "sga": sga, "q": q, "maze": MazeConfig()}
 
 

@@ -151,7 +151,8 @@ class Config(Settings):
         if not self.rules:
             idle["rules_rate"] = "without --rules"
         if self.task.discrete:
-            idle["q.segments"] = "with --maze.actions three" if self.env == MAZE else elsewhere
+            why = "with --maze.actions three" if self.env == MAZE else elsewhere
+            idle |= {"q.segments": why, "q.points": why}
         fixed, acting = self.network == "fixed", self._acting
         idle |= dict.fromkeys(
             ("axes", "reward_scale") if self.env == MAZE else ("maze", "pose"), elsewhere

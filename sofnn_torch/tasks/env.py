@@ -2,8 +2,8 @@
 
 import difflib
 import functools
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import gymnasium
@@ -12,7 +12,7 @@ from gymnasium.spaces import Box, Discrete, Space
 from numpy.typing import NDArray
 
 from sofnn_torch.network.axes import Axis
-from sofnn_torch.tasks.known import KNOWN
+from sofnn_torch.tasks.known import KNOWN, TUNED
 
 MOST_INPUTS = 64  # rules that cover more inputs than this are as many as the states
 MOST_ACTIONS = 1_000
@@ -30,7 +30,7 @@ class Spaces:
         discrete: one of the actions is chosen.
         reward_scale: so that values are about 1; None if the task is not known.
         best: the most, so scaled, that a state can be worth as far as is known.
-        sharpness: width of the rules of action values, as a share of an axis; None for the usual.
+        tuned: settings of Q-learning that differ from those for unknown tasks, by table.
     """
 
     axes: tuple[Axis, ...]
@@ -38,7 +38,7 @@ class Spaces:
     discrete: bool
     reward_scale: float | None = None
     best: float = 1.0
-    sharpness: float | None = None
+    tuned: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
 
 class Translation:
@@ -218,7 +218,7 @@ def spaces(env: gymnasium.Env) -> Spaces:
     spec = getattr(env, "spec", None)
     known = KNOWN.get(spec.name) if spec else None
     if known and (len(known.axes), len(known.actions)) == (observed.low.size, number):
-        own = known.reward_scale, known.best, known.sharpness
+        own = known.reward_scale, known.best, TUNED.get(spec.name, {})
         return Spaces(known.axes, known.actions, discrete, *own)
     names = tuple(f"action {j + 1}" for j in range(number)) if number > 1 else ("action",)
     ends = zip(observed.low.ravel(), observed.high.ravel(), strict=True)

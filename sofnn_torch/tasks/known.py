@@ -6,6 +6,7 @@ where an episode ends earlier, or where no policy gets that far.
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 from sofnn_torch.network.axes import Axis
 
@@ -21,14 +22,12 @@ class Known:
         actions: names of its actions, or of the numbers that make one.
         reward_scale: of its rewards, so that values are about 1.
         best: the most, so scaled, that any state can be worth.
-        sharpness: width of the rules of action values, as a share of an axis; None for the usual.
     """
 
     axes: tuple[Axis, ...]
     actions: tuple[str, ...]
     reward_scale: float = STEP
     best: float = 1.0
-    sharpness: float | None = None
 
 
 CAR = Axis("position", "", -1.2, 0.6), Axis("velocity", "", -0.07, 0.07)
@@ -59,9 +58,29 @@ POLE = (
     Axis("pole velocity", "rad/s", -3, 3),
 )
 
+# Found by the trials that docs/tasks.md tells of; what is not here is as for unknown tasks.
+TUNED: dict[str, dict[str, dict[str, Any]]] = {
+    "MountainCar": {"net": {"width": (0.05,)}},
+    "Acrobot": {
+        "net": {"width": (0.25, 0.25, 0.25, 0.25, 0.1, 0.1)},
+        "q": {"initial": -0.5, "temperature": 0.005},
+    },
+    "Pendulum": {
+        "net": {"width": (0.1,), "theta": 0.5},
+        "q": {
+            "points": True,
+            "initial": -0.5,
+            "temperature": 0.02,
+            "rate_action": 0.6,
+            "trace_decay": 0.5,
+            "replays": 100,
+        },
+    },
+}
+
 # By the name in Gymnasium's registry, without the version.
 KNOWN = {
-    "MountainCar": Known(CAR, ("push left", "no push", "push right"), best=0.0, sharpness=0.05),
+    "MountainCar": Known(CAR, ("push left", "no push", "push right"), best=0.0),
     "MountainCarContinuous": Known(CAR, ("push",)),
     "CartPole": Known(POLE, ("push left", "push right")),
     "Acrobot": Known(ACROBOT, ("torque -1", "no torque", "torque +1"), best=0.0),
