@@ -247,6 +247,25 @@ def test_rewards_are_scaled_so_that_values_are_about_one():
     assert survey.scale([[0.0, 0.001]]) == survey.scale([[0.0], []]) == 1.0
 
 
+def test_an_unknown_state_is_worth_nothing_only_where_every_step_costs():
+    rng = np.random.default_rng(0)
+    effort = [(-0.1 * rng.uniform(-1, 1, 999) ** 2).tolist()]  # idling is free
+    for trials, initial in [
+        ([[-1.0] * 200], 0.0),
+        ([[-1.0] * 80 + [0.0], [-1.0] * 90 + [0.0]], 0.0),
+        ([[1.0] * 20], 1.0),
+        ([[0.0] * 50], 1.0),
+        (effort, 1.0),
+    ]:
+        assert survey.optimism(trials)["initial"] == initial
+
+
+def test_unknown_tasks_are_learned_with_what_random_play_said(toy):
+    assert Config(env=toy(reward=-4.0), agent="q").q.initial == 0.0
+    assert Config(env=toy(reward=4.0), agent="q").q.initial == 1.0
+    assert Config(env="CartPole-v1", agent="q").q.value_limit == 1.0
+
+
 def test_what_random_play_found_is_saved_with_the_run(toy, tmp_path):
     env = toy(observations=Box(-np.inf, np.inf, (2,)), reward=-4.0)
     config = short(env)
@@ -359,6 +378,37 @@ def test_learners_see_scaled_rewards_and_records_the_real_ones(toy):
 
 
 # ------------------------------------------------------------------------------------- learning
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("env", "trials", "least"),
+    [
+        ("MountainCar-v0", 150, -175),  # chance: -200
+        ("CartPole-v1", 120, 47),  # 22
+        ("Acrobot-v1", 100, -400),  # -500
+        ("MountainCarContinuous-v0", 60, 0),  # -33, and 0 for doing nothing
+        ("Pendulum-v1", 100, -1000),  # -1200
+    ],
+)
+def test_q_learning_learns_tasks_that_it_does_not_know(env, trials, least, tmp_path, monkeypatch):
+    """With axes, scale and optimism from random play most seeds are far from chance."""
+    monkeypatch.setattr("sofnn_torch.tasks.env.KNOWN", {})
+    look.cache_clear()
+    survey.survey.cache_clear()
+    returns = []
+    try:
+        for seed in range(3):
+            config = Config(env=env, agent="q", seed=seed, trials=trials)
+            assert config.task.axes[0].name == "obs 1"
+            run = training.train(config, quick_options(tmp_path / str(seed)))
+            config, learner, _, _ = evaluate.load(run)
+            records = evaluate.evaluate(config, learner, 10)
+            returns.append(sum(record.reward for record in records) / len(records))
+    finally:
+        look.cache_clear()
+        survey.survey.cache_clear()
+    assert sorted(returns)[1] > least
 
 
 @pytest.mark.slow

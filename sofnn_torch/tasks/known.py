@@ -60,10 +60,9 @@ POLE = (
 
 # Found by the trials that docs/tasks.md tells of; what is not here is as for unknown tasks.
 TUNED: dict[str, dict[str, dict[str, Any]]] = {
-    "MountainCar": {"net": {"width": (0.05,)}},
+    "MountainCar": {"net": {"width": (0.05,)}, "q": {"trace_decay": 0.95, "action_gap": 0.7}},
     "Acrobot": {
-        "net": {"width": (0.25, 0.25, 0.25, 0.25, 0.1, 0.1)},
-        "q": {"initial": -0.5, "temperature": 0.005},
+        "q": {"initial": -0.5, "temperature": 0.005, "trace_decay": 0.95, "action_gap": 0.7}
     },
     "Pendulum": {
         "net": {"width": (0.1,), "theta": 0.5},

@@ -47,7 +47,8 @@ def explored(env: TaskEnv, found: Spaces, seed: int) -> Spaces:
     """The spaces of an environment, with what `STEPS` steps of random play say of it."""
     states, rewards = play_at_random(env, seed)
     axes = tuple(map(within, found.axes, states.min(0).tolist(), states.max(0).tolist()))
-    return replace(found, axes=axes, reward_scale=scale(rewards))
+    tuned = {"q": optimism(rewards)} if found.reward_scale is None else found.tuned
+    return replace(found, axes=axes, reward_scale=scale(rewards), tuned=tuned)
 
 
 def play_at_random(env: TaskEnv, seed: int) -> tuple[np.ndarray, list[list[float]]]:
@@ -105,3 +106,14 @@ def scale(trials: Sequence[Sequence[float]]) -> float:
     sizes = [abs(reward) for rewards in trials for reward in rewards]
     value = max(*returns, float(np.mean(sizes)) / (1 - DISCOUNT))
     return float(f"{1 / value:.2g}") if 1 < value < math.inf else 1.0
+
+
+def optimism(trials: Sequence[Sequence[float]]) -> dict[str, float]:
+    """Settings of Q-learning: what an unknown state is worth, and the most that any may be.
+
+    Where nearly every step costs something, 0 is optimistic. Where a policy may do nothing for
+    nothing it is not, and is a trap. Random play may miss a goal worth far more than all it saw.
+    """
+    steps = np.array([reward for rewards in trials for reward in rewards])
+    costly = np.quantile(steps, 0.95) < 0.5 * steps.mean() < 0.0
+    return {"initial": 0.0 if costly else 1.0, "value_limit": 100.0}
