@@ -11,6 +11,7 @@ import torch
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 
 import compiled
+import growth
 import learning
 import neighbours
 import reduce
@@ -164,3 +165,40 @@ def test_rows_that_are_not_measured_again_stay(tmp_path):
     new = [cell("CartPole-v1", "with", 3), cell("MountainCar-v0", "without", 4)]
     returns = [c["seeds"][0]["return"] for c in tasks.merged(new, out)]
     assert returns == [4, 3, 2]
+
+
+@pytest.mark.parametrize(
+    ("count", "dimensions", "shape"),
+    [
+        (81, 2, (9, 9)),
+        (90, 2, (10, 9)),
+        (16, 4, (2, 2, 2, 2)),
+        (130, 4, (4, 4, 3, 3)),
+        (1, 6, (1,) * 6),
+    ],
+)
+def test_a_grid_has_about_as_many_rules_as_grew(count, dimensions, shape):
+    assert growth.grid(count, dimensions) == shape
+
+
+def test_growth_and_grid_are_searched_alike_and_compared_on_other_seeds(monkeypatch, tmp_path):
+    asked = []
+
+    def learned(config, steps, run):
+        asked.append((config.network, config.seed, config.net.width, config.net.grid))
+        best = 1.0 if config.network == "sofnn" else 0.7
+        near = -abs(float(run.name.split("-")[-3]) - best)  # the factor of the widths
+        return {"seed": config.seed, "steps": steps, "rules": 80 + config.seed, "return": near}
+
+    monkeypatch.setattr(growth, "learned", learned)
+    row = growth.compared("MountainCar-v0", growth.Options(seeds=5))
+    assert (row["sofnn"]["factor"], row["fixed"]["factor"]) == (1.0, 0.7)
+    assert row["fixed"]["shape"] == (9, 9)  # 82 grew in the median
+    for network in ("sofnn", "fixed"):
+        seeds = [seed for name, seed, *_ in asked if name == network]
+        assert seeds == [100, 101] * 4 + [0, 1, 2, 3, 4]
+    assert asked[-1] == ("fixed", 4, (0.0389, 0.0389), (9, 9))
+    text = growth.table([row]).splitlines()
+    assert len(text) == 4 and "80-84" in text[2] and "(9 x 9)" in text[3]
+    growth.draw([row], tmp_path / "growth.png")
+    assert (tmp_path / "growth.png").read_bytes().startswith(b"\x89PNG")
