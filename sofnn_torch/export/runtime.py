@@ -21,19 +21,19 @@ import json
 import math
 import sys
 from collections import Counter
+from functools import cached_property
 from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 FORMAT, VERSION = "sofnn-torch policy", 1
 LARGEST = 2**28  # bytes of a file
 PARTS = ("centre", "width", "consequents")
 LISTS, TABLES = ("axes", "actions", "outputs", "rules"), ("decision", "command")
 ENTRIES = dict.fromkeys(LISTS, list) | dict.fromkeys(TABLES, dict) | {"discrete": bool}
-Numbers = NDArray[np.float64]
+Numbers = np.ndarray[Any, np.dtype[np.float64]]
 
 
 class Policy:
@@ -63,18 +63,18 @@ class Policy:
 
     def __init__(self, data: Any, seed: int | None = None, explore: bool = False):
         check(data)
-        self.data, self.explore = data, explore
+        self.data, self.seed, self.explore = data, seed, explore
         self.discrete, self.decision = data["discrete"], data["decision"]
         self.robot: dict[str, Any] = data.get("robot") or {}
         self.returns: Counter[int] = Counter()
         try:
             self._take(data)
-            self.reseed(0)
-            self._is_new(self.centres[0][: len(self.low)])
-            self.command(self.act(self.centres[0][: len(self.low)], explore=1))
+            self._is_new(x := self.centres[0][: len(self.low)])
+            self.command(self.act(x))
+            if self.decision["kind"] == "values":
+                self.decision["temperature"] + self.decision["edges"][len(self.codes) - 1][1]
         except (KeyError, TypeError, IndexError, AttributeError, StopIteration) as error:
             raise ValueError(f"not a policy: {error!r:.80} is missing or out of place") from None
-        self.reseed(seed)
 
     def _take(self, data: Any) -> None:
         """Take the numbers of a policy, in the precision of the network the same as there."""
@@ -84,10 +84,8 @@ class Policy:
         self.turning = [(i, a["period"]) for i, a in enumerate(axes) if a["period"]]
         self.seen, self.idle = np.empty((0, len(axes))), 0
         self.acting = bool(self.decision.get("action_input"))
-        kept = [data["clipped"] and not axis["period"] for axis in axes]
-        ends = [
-            (a["low"], a["high"]) if k else (None, None) for a, k in zip(axes, kept, strict=True)
-        ]
+        clips = data["clipped"]
+        ends = [(a["low"], a["high"]) if clips and not a["period"] else (None,) * 2 for a in axes]
         self.low = np.array([-np.inf if low is None else low for low, _ in ends], float)
         self.high = np.array([np.inf if high is None else high for _, high in ends], float)
 
@@ -100,9 +98,10 @@ class Policy:
         periods = [axis["period"] for axis in axes] + [0.0] * self.acting
         self.periods = np.array(periods, kind).astype(float)
 
-    def reseed(self, seed: int | None) -> None:
-        """Begin the chance anew."""
-        self.rng = np.random.default_rng(seed)
+    @cached_property
+    def rng(self) -> np.random.Generator:
+        """The chance, loaded when first needed, which is not at once."""
+        return np.random.default_rng(self.seed)
 
     # ---------------------------------------------------------------------------------- a trial
 
@@ -271,7 +270,7 @@ def check(data: Any) -> None:
         for part, size in zip(PARTS, (n, n, len(data["outputs"])), strict=True):
             given = rule.get(part) if isinstance(rule, dict) else None
             values = given if isinstance(given, list) else []
-            plain = all(type(v) in (int, float) and math.isfinite(v) for v in values)
+            plain = {int, float}.issuperset(map(type, values)) and all(map(math.isfinite, values))
             if len(values) != size or not plain:
                 raise ValueError(f"rule {i}, {part}: must be a list of {size} finite numbers")
             if part == "width" and min(values) <= 0:
