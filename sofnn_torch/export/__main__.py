@@ -115,7 +115,7 @@ def run(options: Options) -> None:
     ]
     folders = dict.fromkeys(path.parent for path in options.to if path.suffix.lower() == ".json")
     written += [(folder / policy.RUNTIME, policy.runtime_source()) for folder in folders]
-    count = len(data["fixed"].rules if "fixed" in data else data["rules"])
+    count = len(data["fixed"].centres if "fixed" in data else data["rules"])
     print(f"{options.run}: {data['learner']} on {data['task']}, {plural(count, 'rule')}")
     for path, content in written:
         checkpoint.write_atomically(path, content)

@@ -14,11 +14,20 @@ from sofnn_torch.runs.guard import LARGEST
 from sofnn_torch.runs.rule_files import shortest
 
 HEAD = re.compile(r"/\* sofnn-torch policy (\{.*\}) \*/")
+CENTRES = re.compile(r"_centres\[[^\]]+\]\[[^\]]+\](?: \w+)? = \{(.*?)\n\};", re.DOTALL)
 TABLE = re.compile(r"_rules\[[^\]]+\]\[[^\]]+\](?: \w+)? = \{(.*?)\n\};", re.DOTALL)
 GAINS = re.compile(r"_gains\[[^\]]+\]\[[^\]]+\](?: \w+)? = \{(.*?)\n\};", re.DOTALL)
 NUMBER = re.compile(r"-?\d[\d.]*(?:e[+-]?\d+)?")
 MOST_BYTES = 2**28
 OWN = ("scales", "bits", "shift", "ends")  # of a policy in whole numbers
+SCALED = {  # by the bits of a gain
+    8: """\
+                own = NAME_BYTE(g++);
+                r = NAME_product((uint16_t)(d << 1), (uint8_t)(32u + (own >> 3)));
+                r >>= (uint8_t)(@SHIFT@ + (own & 7u));""",
+    16: """\
+                r = NAME_product((uint16_t)(d << 1), NAME_READ(g++)) >> @SHIFT@;""",
+}
 
 
 def to_header(data: dict[str, Any], path: Path, precision: str) -> bytes:
@@ -60,8 +69,9 @@ def from_header(path: Path) -> dict[str, Any]:
         data = json.loads(head[1])
         rows = _numbers(table[1])
         if "scales" in data:
-            gains = GAINS.search(text)
-            return _fixed_from(data, np.array(rows), np.array(_numbers(gains[1] if gains else "")))
+            others = (table.search(text) for table in (CENTRES, GAINS))
+            centres, gains = (_numbers(found[1] if found else "") for found in others)
+            return _fixed_from(data, *map(np.array, (centres, gains, rows)))
         data["rules"] = _rules(data, rows)
         return Policy(data).data
     except OSError as error:
@@ -88,20 +98,22 @@ def _rules(data: dict[str, Any], rows: list[list[float]]) -> list[dict[str, list
     return [{"centre": u, "width": v, "consequents": c} for u, v, c in parts]
 
 
-def _fixed_from(data: dict[str, Any], table: Any, gains: Any) -> dict[str, Any]:
-    """A policy in whole numbers from its head, its table (K, n + M) and its gains (K or 1, n)."""
+def _fixed_from(data: dict[str, Any], centres: Any, gains: Any, concluded: Any) -> dict[str, Any]:
+    """A policy in whole numbers from its head, and tables as in `FixedPolicy`."""
     own = {name: data.pop(name) for name in OWN}
     n = len(own["scales"])
     wanted = {"normal": data["decision"].get("numbers")}
     wanted["values"] = len(data["decision"].get("codes", []))
-    if table.shape[1] != n + wanted[data["decision"]["kind"]] or gains.shape[1] != n:
+    columns = [table.shape[1] for table in (centres, gains, concluded)]
+    if columns != [n, n, wanted[data["decision"]["kind"]]] or len(centres) != len(concluded):
         raise ValueError("its rules are not those of its inputs and outputs")
-    if len(gains) not in (1, len(table)):
-        raise ValueError(f"{len(table)} rules have {len(gains)} rows of gains")
-    if min(table.min(), gains.min()) < 0 or max(table.max(), gains.max()) >= fixed.WHOLE:
-        raise ValueError("numbers of its rules need more than 16 bits")
-    tables = {"rules": table.astype(np.uint32), "gains": gains.astype(np.uint32)}
-    return {**data, "fixed": fixed.FixedPolicy(data, **own, **tables)}
+    if len(gains) not in (1, len(centres)):
+        raise ValueError(f"{len(centres)} rules have {len(gains)} rows of gains")
+    for table, bits in ((centres, own["bits"]), (gains, own["bits"]), (concluded, 8)):
+        if table.min() < 0 or table.max() >= 2**bits:
+            raise ValueError(f"numbers of its rules need more than {bits} bits")
+    tables = [table.astype(np.uint32) for table in (centres, gains, concluded)]
+    return {**data, "fixed": fixed.FixedPolicy(data, *own.values(), *tables)}
 
 
 def _comment(data: dict[str, Any]) -> str:
@@ -219,16 +231,19 @@ def _fixed(name: str, policy: fixed.FixedPolicy) -> str:
         "ABOUT": "\n".join(f" *     {line}" for line in about),
         "STATE": str(len(data["axes"])),
         "INPUTS": str(n),
-        "RULES": str(len(policy.rules)),
-        "COLUMNS": str(policy.rules.shape[1]),
+        "RULES": str(len(policy.centres)),
         "SUMS": "1" if policy.acting else str(policy.conclusions),
         "CONCLUSIONS": str(policy.conclusions),
-        "TABLE": _rows(policy.rules),
+        "CENTRES": _rows(policy.centres),
+        "TABLE": _rows(policy.concluded),
         "GAINS": _rows(policy.gains),
         "GAIN_ROWS": str(len(policy.gains)),
-        "GAIN_BITS": str(policy.bits),
-        "GAIN_READ": "word" if policy.bits == 16 else "byte",
+        "BITS": str(policy.bits),
+        "CENTRE": "(uint16_t)((uint16_t)NAME_BYTE(p++) << 8)"
+        if policy.bits == 8
+        else "NAME_READ(p++)",
         "SAME_GAINS": f"            g -= {n};" * (len(policy.gains) == 1),
+        "OWN": "                uint8_t own;" * (policy.bits == 8),
         "FIRST": " + first" * policy.acting,
         "ARGUMENT": ", uint16_t first" * policy.acting,
         "SHIFT": str(policy.shift),
@@ -243,7 +258,8 @@ def _fixed(name: str, policy: fixed.FixedPolicy) -> str:
         "CODES": ", ".join(f"{code}u" for code in policy.codes) if policy.acting else "",
         "POINTS": ", ".join(map(_c, data["decision"].get("representatives", []))),
     }
-    return _fill(templates.FIXED + templates.FIXED_ACTS[kind, action] + templates.END, values)
+    text = templates.FIXED.replace("@SCALED@", SCALED[policy.bits])
+    return _fill(text + templates.FIXED_ACTS[kind, action] + templates.END, values)
 
 
 def _fill(text: str, values: dict[str, str]) -> str:

@@ -1,14 +1,17 @@
 """A policy in whole numbers: the tables of the C header of precision int16, and their model.
 
-Everything is unsigned, 16 bits in the tables and 32 in between. For rule k at inputs x:
+Everything is unsigned, at most 16 bits in the tables and 32 in between. For rule k at inputs x:
 
-    r_i = 2 |x_i - u_i| g_i / 2^S         distance over width with 12 binary digits, at most 8
+    r_i = 2 |x_i - u_i| g_i / 2^S_i       distance over width with 12 binary digits, at most 8
     z   = sum_i r_i^2 / 2^16              so that the firing strength is 2^-z, 8 digits
     w   = 2^-(z - min z) * 65535          by a cubic for the fraction and a shift for the rest
-    y_j = sum_k (w c_j / 2^16) / sum_k w
+    y_j = sum_k (w c_j / 2^8) / sum_k w
 
-The least z is found first, so the nearest rules answer far from all. Gains g have 8 bits where that
-rounds none by more than 2 %, else 16. An input that wraps takes all 16 bits, and wraps by itself.
+The least z is found first, so the nearest rules answer far from all. Rules with widths of their own
+take bytes: the upper 8 bits of a centre u, and floating gains, where g_i is 32 and the upper five
+digits, S_i is S and the lower three. That rounds no gain by more than 1.6 % and spans 1 to 252. If
+all widths are the same, or some too narrow or too different, centres and gains have 16 bits, and
+S_i is S. Conclusions c have 8 bits. An input that wraps takes all 16 bits, and wraps by itself.
 
 What does not change the plain mean or greedy action is left out: sigma, the value, and of
 Q-learning all that is the same for every action.
@@ -22,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 CUBIC = (45340, 15200, 2632)  # of 2^-f over [0, 1), in units of 2^-16: off by at most 7e-5
-HALF, WHOLE = 2**15, 2**16
+HALF, WHOLE, BYTE = 2**15, 2**16, 2**8
 LEAST_WIDTH = 32  # steps of its input that a rule must be wide
 DIGITS_PER_WIDTH = math.sqrt(0.5 * math.log2(math.e))  # exp(-(d / v)^2 / 2) = 2^-(this d / v)^2
 
@@ -39,10 +42,11 @@ class FixedPolicy:
     Attributes:
         head: the neutral policy without its rules.
         scales: origin and step of each input, as in ``x = (value - origin) / step``.
-        bits: of the gains.
-        shift: S.
-        rules: n centres and M conclusions. Shape: (K, n + M).
+        bits: of centres and gains; gains of 8 bits are floating.
+        shift: S, with gains of 8 bits the least S_i.
+        centres: of the rules. Shape: (K, n).
         gains: of each rule, or one row if all have the same. Shape: (K or 1, n).
+        concluded: conclusions of the rules. Shape: (K, M).
         ends: conclusions that stand for the edges between discrete actions, or for -1 and 1.
     """
 
@@ -51,8 +55,9 @@ class FixedPolicy:
     bits: int
     shift: int
     ends: list[int]
-    rules: Integers
+    centres: Integers
     gains: Integers
+    concluded: Integers
 
     @property
     def n(self) -> int:
@@ -62,7 +67,7 @@ class FixedPolicy:
     @property
     def conclusions(self) -> int:
         """Conclusions M of a rule."""
-        return self.rules.shape[1] - self.n
+        return self.concluded.shape[1]
 
     @property
     def most(self) -> int:
@@ -114,17 +119,20 @@ class FixedPolicy:
 
     def _sums(self, x: Integers, columns: list[int]) -> tuple[Integers, Integers]:
         """Weighted sums (B, C) of some conclusions, and of the weights (B,)."""
-        d = (x[:, None] - self.rules[:, : self.n]) % WHOLE
+        d = (x[:, None] - self.centres * (WHOLE >> self.bits)) % WHOLE
         d = np.where(d >= HALF, WHOLE - 1 - d, d)
-        r = ((2 * d * self.gains) >> self.shift).clip(max=self.most)
+        gains: Any = self.gains
+        shift: Any = np.uint32(self.shift)
+        if self.bits == 8:
+            gains, shift = 32 + (gains >> 3), shift + (gains & 7)
+        r = ((2 * d * gains) >> shift).clip(max=self.most)
         z = (r**2 >> 16).sum(2, dtype=np.uint32)
         z = z - z.min(1, keepdims=True)
         f = (z << 8) % WHOLE
         a, b, c = CUBIC
         w = WHOLE - 1 - (f * (a - (f * (b - (f * c >> 16)) >> 16)) >> 16)
         w = w >> (z >> 8).clip(max=16)
-        conclusions = self.rules[:, self.n :][:, columns]
-        sums = ((w[:, :, None] * conclusions) >> 16).sum(1, dtype=np.uint32)
+        sums = ((w[:, :, None] * self.concluded[:, columns]) >> 8).sum(1, dtype=np.uint32)
         return sums, w.sum(1, dtype=np.uint32)
 
 
@@ -139,7 +147,7 @@ def make(data: dict[str, Any]) -> FixedPolicy:
         axes.append({"name": "action", "low": -1.0, "high": 1.0, "period": 0.0})
     part = {name: np.array([r[name] for r in data["rules"]]) for name in data["rules"][0]}
     scales = [_scale(axis, u) for axis, u in zip(axes, part["centre"].T, strict=True)]
-    centres = _placed(part["centre"], scales, [axis["period"] for axis in axes])
+    centres: Any = _placed(part["centre"], scales, [axis["period"] for axis in axes])
     steps = np.array([step for _, step in scales])
     narrow = (part["width"] / steps).min(0)
     if narrow.min() < LEAST_WIDTH:
@@ -149,14 +157,19 @@ def make(data: dict[str, Any]) -> FixedPolicy:
             "range: use --precision float"
         )
     gains = DIGITS_PER_WIDTH * steps / part["width"] * 2.0**11
-    bits = 16 if (gains == gains[0]).all() or gains.max() > 10 * gains.min() else 8
-    shift = min(bits, math.floor(math.log2((2**bits - 1) / gains.max())))
-    gains = np.round(gains * 2.0**shift).astype(np.uint32)
     gains = gains[:1] if (gains == gains[0]).all() else gains
-    conclusions, ends = _conclusions(data, part["consequents"], len(data["axes"]))
-    rules = np.hstack([centres, conclusions]).astype(np.uint32)
+    shifts = np.floor(np.log2(63.49 / gains)).astype(int)  # so that five digits follow the first
+    shift, bits = int(shifts.min()), 8
+    if len(gains) > 1 and shifts.max() < shift + 8 and narrow.min() >= 2 * BYTE:
+        centres = np.round(centres / BYTE) % BYTE
+        gains = 8 * (np.round(gains * 2.0**shifts) - 32) + shifts - shift
+    else:
+        bits, shift = 16, min(16, math.floor(math.log2((WHOLE - 1) / gains.max())))
+        gains = np.round(gains * 2.0**shift)
+    concluded, ends = _conclusions(data, part["consequents"], len(data["axes"]))
     head = {name: value for name, value in data.items() if name != "rules"}
-    return FixedPolicy(head, scales, bits, shift, ends, rules, gains)
+    tables = [table.astype(np.uint32) for table in (centres, gains, concluded)]
+    return FixedPolicy(head, scales, bits, shift, ends, *tables)
 
 
 def _scale(axis: dict[str, Any], centres: NDArray[Any]) -> list[float]:
@@ -184,10 +197,10 @@ def _conclusions(data: dict[str, Any], table: NDArray[Any], n: int) -> tuple[Any
         limit = max(1.0, np.abs(means).max())
 
         def units(values: Any) -> Any:
-            return np.round((np.asarray(values) / limit + 1) / 2 * (WHOLE - 1))
+            return (np.asarray(values) / limit + 1) / 2 * (BYTE - 1)
 
         ends = decision["edges"] if data["discrete"] else [-1.0, 1.0]
-        return units(means), units(ends).astype(int).tolist()
+        return np.round(units(means)), np.round(units(ends) * BYTE).astype(int).tolist()
     values = table[:, n:-1] @ np.array(decision["codes"]).T
     if decision["action_input"]:
         if table[:, :n].any():
@@ -199,7 +212,7 @@ def _conclusions(data: dict[str, Any], table: NDArray[Any], n: int) -> tuple[Any
         values = values - values.min()
     else:
         values = values - values.min(1, keepdims=True)
-    return np.round(values / (values.max() or 1.0) * (WHOLE - 1)), []
+    return np.round(values / (values.max() or 1.0) * (BYTE - 1)), []
 
 
 def _share(sums: Integers, total: Integers) -> Integers:

@@ -167,7 +167,7 @@ END = "\n#endif\n"
 
 FIXED = """\
 /* A policy that sofnn-torch learned: a fuzzy network of @RULES@ rules with Gaussian memberships.
- * C99 in whole numbers: no allocation, no library, 16 bits in the table and 32 in between.
+ * C99 in whole numbers: no allocation, no library, 16 bits in the tables and 32 in between.
  * Equal to the model in sofnn_torch/export/fixed.py bit for bit. The state, in:
  *
 @ABOUT@
@@ -184,22 +184,24 @@ FIXED = """\
 #include <avr/pgmspace.h>
 #define NAME_TABLE PROGMEM
 #define NAME_READ(p) pgm_read_word(p)
-#define NAME_GAIN(p) pgm_read_@GAIN_READ@(p)
+#define NAME_BYTE(p) pgm_read_byte(p)
 #define NAME_CALLED __attribute__((noinline)) /* smaller */
 #else
 #define NAME_CALLED
 #define NAME_TABLE
 #define NAME_READ(p) (*(p))
-#define NAME_GAIN(p) (*(p))
+#define NAME_BYTE(p) (*(p))
 #endif
 
-/* Of each rule: centres and conclusions. */
-static const uint16_t NAME_rules[@RULES@][@COLUMNS@] NAME_TABLE = {
-@TABLE@
+/* Of each rule: centres; gains, one row if all have the same; conclusions. */
+static const uint@BITS@_t NAME_centres[@RULES@][@INPUTS@] NAME_TABLE = {
+@CENTRES@
 };
-/* Of each rule, or of all the same: gains. */
-static const uint@GAIN_BITS@_t NAME_gains[@GAIN_ROWS@][@INPUTS@] NAME_TABLE = {
+static const uint@BITS@_t NAME_gains[@GAIN_ROWS@][@INPUTS@] NAME_TABLE = {
 @GAINS@
+};
+static const uint8_t NAME_rules[@RULES@][@CONCLUSIONS@] NAME_TABLE = {
+@TABLE@
 };
 
 static NAME_CALLED uint32_t NAME_product(uint16_t a, uint16_t b) { return (uint32_t)a * b; }
@@ -216,15 +218,17 @@ static inline uint32_t NAME_sums(const uint16_t x[@INPUTS@], uint32_t sums[@SUMS
     @INDEX@ j;
     for (j = 0; j < @SUMS@; j++) sums[j] = 0;
     for (pass = 0; pass < 2; pass++) { /* weights are relative to the nearest rule */
-        const uint16_t *p = NAME_rules[0];
-        const uint@GAIN_BITS@_t *g = NAME_gains[0];
-        for (k = 0; k < @RULES@; k++, p += @CONCLUSIONS@) {
+        const uint@BITS@_t *p = NAME_centres[0];
+        const uint8_t *c = NAME_rules[0];
+        const uint@BITS@_t *g = NAME_gains[0];
+        for (k = 0; k < @RULES@; k++, c += @CONCLUSIONS@) {
             uint16_t z = 0, f, w;
             for (i = 0; i < @INPUTS@; i++) {
-                uint16_t d = (uint16_t)(x[i] - NAME_READ(p++));
+                uint16_t d = (uint16_t)(x[i] - @CENTRE@);
                 uint32_t r;
+@OWN@
                 if (d & 0x8000u) d = (uint16_t)~d;
-                r = NAME_product((uint16_t)(d << 1), NAME_GAIN(g++)) >> @SHIFT@;
+@SCALED@
                 if (r > @MOST@) r = @MOST@;
                 z = (uint16_t)(z + NAME_times((uint16_t)r, (uint16_t)r));
             }
@@ -239,7 +243,7 @@ static inline uint32_t NAME_sums(const uint16_t x[@INPUTS@], uint32_t sums[@SUMS
             w = NAME_times(f, (uint16_t)(@B@ - NAME_times(f, @C@)));
             w = (uint16_t)((uint16_t)(65535u - NAME_times(f, (uint16_t)(@A@ - w))) >> (z >> 8));
             total += w;
-            for (j = 0; j < @SUMS@; j++) sums[j] += NAME_times(w, NAME_READ(p + j@FIRST@));
+            for (j = 0; j < @SUMS@; j++) sums[j] += NAME_product(w, NAME_BYTE(c + j@FIRST@)) >> 8;
         }
     }
     return total;
