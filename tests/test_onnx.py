@@ -29,10 +29,9 @@ def test_a_graph_concludes_and_decides_as_torch_at_any_batch_size(kind):
         outputs, action = run.run(["outputs", "action"], {"state": x})
         assert len(outputs) == len(action) == count
         seen = torch.from_numpy(ours.state(x).astype(np.float32))
-        with torch.no_grad():  # in batches that are computed state by state
+        with torch.no_grad():
             inputs = agent.network_inputs(seen)
-            flat = inputs.reshape(-1, inputs.shape[-1])
-            expected = torch.cat([agent.net(part) for part in flat.split(31)])
+            expected = agent.net(inputs.reshape(-1, inputs.shape[-1]))
         expected = expected.reshape(outputs.shape).numpy()
         np.testing.assert_allclose(outputs, expected, rtol=1e-6, atol=1e-6)
         plan = agent.plan(seen.numpy())
@@ -40,7 +39,21 @@ def test_a_graph_concludes_and_decides_as_torch_at_any_batch_size(kind):
         assert (near | (margins(ours, x) < 1e-5)).all()
         if plan.choice is not None and data["decision"]["kind"] == "values":
             (values,) = run.run(["values"], {"state": x})
-            np.testing.assert_allclose(values.max(1), plan.value, atol=1e-4)  # a batch is a product
+            np.testing.assert_allclose(values.max(1), plan.value, atol=2e-6)
+
+
+def test_many_narrow_rules_with_values_of_a_hundred_conclude_as_torch_at_any_batch_size():
+    config, agent = learner("q", rules=784)
+    net, rng = agent.net, np.random.default_rng(0)
+    narrow = torch.from_numpy(rng.uniform([0.02, 0.02, 0.2], [0.06, 0.06, 0.5], (784, 3))).float()
+    net.replace_rules(net.centres, narrow, 100 * net.consequents)
+    run = session(graph.to_onnx(policy.describe(config, agent)))
+    for count in (1, 31, 32, 33, 512):
+        x = states(agent, count, seed=count).clip([0, 0, -3.1], [1, 1, 3.1]).astype(np.float32)
+        (outputs,) = run.run(["outputs"], {"state": x})
+        with torch.no_grad():
+            expected = net(torch.from_numpy(x)).numpy()
+        assert np.abs(outputs - expected).max() < 1e-6 * np.abs(net.consequents.numpy()).max()
 
 
 def test_a_graph_is_read_and_written_again(tmp_path, command):  # noqa: F811

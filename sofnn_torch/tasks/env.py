@@ -217,7 +217,7 @@ def spaces(env: gymnasium.Env) -> Spaces:
     number = int(acted.n) if isinstance(acted, Discrete) else acted.low.size
     spec = getattr(env, "spec", None)
     known = KNOWN.get(spec.name) if spec else None
-    if known and (len(known.axes), len(known.actions)) == (observed.low.size, number):
+    if spec and known and (len(known.axes), len(known.actions)) == (observed.low.size, number):
         own = known.reward_scale, known.best, TUNED.get(spec.name, {})
         return Spaces(known.axes, known.actions, discrete, *own)
     names = tuple(f"action {j + 1}" for j in range(number)) if number > 1 else ("action",)
