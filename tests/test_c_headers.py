@@ -159,6 +159,28 @@ def test_learned_rules_in_bytes_decide_as_the_network_at_98_of_100_states(file):
     assert (model.actions(model.inputs(x)) == [ours.act(state) for state in x]).mean() > 0.98
 
 
+@pytest.mark.parametrize("trials", [1, pytest.param(20, marks=pytest.mark.slow)])
+@each_learned
+def test_learned_rules_in_bytes_drive_as_the_policy_in_python_does(file, trials):
+    data = policy.from_json(file)
+    ours, model = runtime.Policy(data), fixed.make(data)
+    answers = ours.act, lambda state: int(model.actions(model.inputs([state]))[0])
+    steps = []
+    for act in answers:
+        env = make_env(Config())
+        env.reset(seed=1000)
+        taken = []
+        for _ in range(trials):
+            (state, info), over = env.reset(), False
+            while not over:
+                state, _, *ends, info = env.step(act(state))
+                over = any(ends)
+            taken.append(info["total_steps"])
+            assert info["success"]
+        steps.append(taken)
+    assert steps[0] == steps[1]
+
+
 @needs_gcc
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["three", "wheels", "q", "q antecedent"])
