@@ -253,7 +253,7 @@ def test_broken_files_load_whole_or_not_at_all(few, tmp_path, monkeypatch, suffi
 
     monkeypatch.setattr(editing.Run, "create", create)
 
-    @trials_of(max_examples=300, deadline=None, database=None, suppress_health_check=SLOW)
+    @trials_of(max_examples=150, deadline=None, database=None, suppress_health_check=SLOW)
     @given(broken(suffix, text))
     def attempt(data):
         rule_file.write_bytes(data)
@@ -271,6 +271,6 @@ def test_broken_files_load_whole_or_not_at_all(few, tmp_path, monkeypatch, suffi
             assert len(str(error).splitlines()) == 1 and len(str(error)) < 400
 
     attempt()
-    assert outcomes["accepted"] and outcomes["refused"] > 60, outcomes
+    assert outcomes["accepted"] and outcomes["refused"] > 30, outcomes
     assert contents(path.parent) == before
     assert [p.name for p in tmp_path.iterdir()] == [rule_file.name]

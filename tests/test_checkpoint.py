@@ -422,7 +422,7 @@ def test_the_whole_lines_of_the_trials_of_a_state_are_left(data, left, state, tm
     assert table.read_text() == "".join(rows) if rows else table.read_bytes() == data
 
 
-@trials_of(max_examples=100, deadline=None)
+@trials_of(max_examples=50, deadline=None)
 @given(st.binary(max_size=400))
 def test_of_any_trial_table_only_whole_lines_of_known_trials_are_left(state, data):
     import tempfile

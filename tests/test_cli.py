@@ -4,10 +4,12 @@ import io
 import json
 import os
 import re
+import runpy
 import signal
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from dataclasses import asdict
 from pathlib import Path
@@ -110,11 +112,16 @@ def test_flags_that_agree_with_the_run_are_fine(run):
     assert main(["--resume", str(run), "--trials", "3", "--net.theta", theta, *QUICK]) == 0
 
 
-def test_train_py_is_the_same_program(here):
-    command = [sys.executable, str(ROOT / "train.py"), "--tirals", "1"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
-    assert done.returncode == 2
-    (line,) = done.stderr.splitlines()
+def test_train_py_is_the_same_program(here, monkeypatch, capsys):
+    monkeypatch.setattr("sys.argv", ["train.py", "--tirals", "1"])
+    before = signal.getsignal(signal.SIGINT)
+    try:
+        with pytest.raises(SystemExit) as stop:
+            runpy.run_path(str(ROOT / "train.py"), run_name="__main__")
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert stop.value.code == 2
+    (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("error: Unrecognized options: --tirals, 1; did you mean --trials?")
 
 
@@ -387,22 +394,19 @@ def test_a_crash_of_one_seed_leaves_the_others(here, capsys, monkeypatch):
     assert checkpoint.find_latest(Path("runs/sga-sofnn-estimated-s0"))[1]["trial"] == 1
 
 
-def test_a_signal_stops_all_seeds_after_saving(here):
-    words = ["--seeds", "0-3", "--workers", "1", "--trials", "100000", *QUICK]
-    child = subprocess.Popen(
-        [sys.executable, "-m", "sofnn_torch.cli", *words],
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+def test_a_signal_stops_all_seeds_after_saving(here, capsys):
     run = Path("runs/sga-sofnn-estimated-s0")
-    deadline = time.monotonic() + 300
-    while not (run / "trials.csv").exists() and time.monotonic() < deadline:
-        time.sleep(0.1)
-    child.send_signal(signal.SIGTERM)
-    _, messages = child.communicate(timeout=120)
-    assert child.returncode == 128 + signal.SIGTERM
-    assert f"--resume {run}" in messages
+
+    def stop_it():
+        deadline = time.monotonic() + 300
+        while not (run / "trials.csv").exists() and time.monotonic() < deadline:
+            time.sleep(0.1)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    threading.Thread(target=stop_it).start()
+    words = ["--seeds", "0-3", "--workers", "1", "--trials", "100000", *QUICK]
+    assert main(words) == 128 + signal.SIGTERM
+    assert f"--resume {run}" in capsys.readouterr().err
     state = checkpoint.find_latest(run)[1]
     assert state["trial"] == len((run / "trials.csv").read_text().splitlines()) - 1 > 0
     assert [path.name for path in Path("runs").iterdir()] == [run.name]

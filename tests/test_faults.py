@@ -537,7 +537,7 @@ def test_a_divergence_can_be_played_again(options):
 def test_extreme_growth_ends_at_the_cap(agent, net, options, capsys):
     # Where a rule is alone for many decisions, traces would add up to steps that diverge.
     parts = {"net": net | {"max_rules": 20}, "maze": {"max_steps": 500}, agent: {"trace_decay": 0}}
-    config = settings(agent, **parts)
+    config = settings(agent, trials=2, **parts)
     run = training.train(config, options)
     state = checkpoint.find_latest(run)[1]
     assert state["network"]["rules"] == 20

@@ -42,7 +42,8 @@ def test_observing_ranges_does_not_disturb_the_robot():
     np.testing.assert_array_equal(seen, [step[0] for step in plain])
 
 
-def test_20000_random_steps_stay_sound():
+@pytest.mark.parametrize("count", [6000, pytest.param(20_000, marks=pytest.mark.slow)])
+def test_random_steps_stay_sound(count):
     env = KheperaMazeEnv(hold=10, max_steps=10**9)
     env.reset(seed=1)
     physics, supports = env.physics, env.physics.data.ncon
@@ -62,14 +63,14 @@ def test_20000_random_steps_stay_sound():
         last = (x, y)
 
     env.on_simulator_step = check
-    while steps < 20_000:
+    while steps < count:
         _, _, terminated, _, info = env.step(rng.choice(3, p=[0.15, 0.7, 0.15]))
         steps += info["steps"]
         bumps += info["collision"]
         if terminated:
             env.reset()
             last = physics.position()
-    assert bumps > 500
+    assert bumps > count / 40
     assert hidden > 0  # bumps with no more contacts than at rest, as a wheel was off the floor
 
 

@@ -294,7 +294,7 @@ def drift(path, runs):
 
 def test_drift_is_that_of_the_khepera_simulator(open_field):
     # Its own noise, over 2000 such runs: median 14 mm and 0.016 rad.
-    position, heading = drift(open_field, 40)
+    position, heading = drift(open_field, 20)
     assert 9.0 < np.median(position) < 20.0
     assert 0.009 < np.median(heading) < 0.025
 

@@ -85,7 +85,7 @@ def test_the_papers_516_steps_are_110_percent_of_the_optimum(held):
 
 
 def test_the_held_optimum_does_not_depend_on_the_resolution(plan, held):
-    for resolution in (0.01, 0.005, 0.0025):
+    for resolution in (0.01, 0.005):  # `held` is finer
         assert optimal_steps(plan, 10, resolution).steps == held.steps
 
 

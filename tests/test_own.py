@@ -1,11 +1,7 @@
 """A learner of one's own goes through the package's own loop; no file of the package changes."""
 
-import os
 import re
-import subprocess
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,6 +9,7 @@ import torch
 from conftest import quick_options
 
 from sofnn_torch import SOFNN, Config, NetworkConfig, load, resume, train
+from sofnn_torch.cli import main
 from sofnn_torch.evaluate import evaluate
 from sofnn_torch.rules import __main__ as rules
 from sofnn_torch.rules import words
@@ -67,15 +64,8 @@ def test_its_rules_are_words_files_and_a_picture(run, tmp_path, capsys):
 
 
 def test_the_command_line_finds_it(tmp_path):
-    home = Path(__file__).parent
     words = ["--agent", OWN, "--own", "epsilon", "0.3", "--trials", "1", "--maze.max-steps", "50"]
-    done = subprocess.run(
-        [sys.executable, str(home.parent / "train.py"), *words, "--quiet", "--runs", str(tmp_path)],
-        capture_output=True,
-        text=True,
-        env=os.environ | {"PYTHONPATH": f"{home}:{home.parent}"},
-    )
-    assert done.returncode == 0, done.stderr
+    assert main([*words, "--quiet", "--runs", str(tmp_path)]) == 0
     (path,) = tmp_path.iterdir()
     assert load(path).agent.settings.epsilon == pytest.approx(0.3)
 

@@ -171,7 +171,7 @@ def test_a_directory_that_cannot_be_written_costs_one_warning(tmp_path, sga_tria
     config, agent, record, path = sga_trial
     blocked = tmp_path / "file"
     blocked.write_text("")
-    monitor = Monitor(blocked, config, picture_every=1)
+    monitor = Monitor(blocked, config, picture_every=2)
     for trial in (1, 2):
         monitor.trial(numbered(record, trial), path, agent, 1.0)
     monitor.flush()
@@ -185,7 +185,7 @@ def test_a_full_disk_costs_one_warning_and_what_it_refused(
     tmp_path, sga_trial, capsys, monkeypatch
 ):
     config, agent, record, path = sga_trial
-    monitor = Monitor(tmp_path, config, picture_every=1, video_every=0)
+    monitor = Monitor(tmp_path, config, picture_every=3, video_every=0)
 
     def full(*_args):
         raise OSError(28, "No space left on device")
