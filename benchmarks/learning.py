@@ -16,7 +16,6 @@ from itertools import cycle
 from pathlib import Path
 from typing import Any
 
-import matplotlib.pyplot as plt
 import numpy as np
 import torch
 from timing import arguments, interleaved, median, ratio, report
@@ -25,6 +24,7 @@ from torch import Tensor
 from sofnn_torch.learners.learner import Learner
 from sofnn_torch.maze.settings import POSE
 from sofnn_torch.network.sofnn import SOFNN
+from sofnn_torch.pictures import figures
 from sofnn_torch.runs.factory import make_agent
 from sofnn_torch.runs.session import arithmetic
 from sofnn_torch.runs.settings import Config
@@ -175,21 +175,23 @@ def growth(repeats: int) -> list[dict[str, Any]]:
     return rows
 
 
+@figures.styled
 def plot(path: Path, rows: list[dict[str, Any]]) -> None:
     """Draw time and memory over the number of rules."""
-    figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.5), layout="constrained")
+    figure, (left, right) = figures.canvas(2, 4.2, 3.2)
     sizes = [row["rules"] for row in rows]
     labels = {"sga us": "SGA", "q us": "Q-learning", "minimal us": "minimal forward + backward"}
-    for name, label in labels.items():
-        style = "--" if name == "minimal us" else "o-"
-        left.loglog(sizes, [row[name] for row in rows], style, label=label, markersize=4)
-    left.set(xlabel="rules", ylabel="µs per decision", title="Time")
-    left.legend(frameon=False)
-    right.loglog(sizes, [row["sga KiB"] for row in rows], "o-", markersize=4)
-    right.set(xlabel="rules", ylabel="KiB", title="Memory: parameters, traces, counters (SGA)")
-    for axes in (left, right):
-        axes.grid(alpha=0.3)
-    figure.savefig(path, dpi=110)
+    for (name, label), (colour, line), mark in zip(
+        labels.items(), figures.SERIES, "os^", strict=False
+    ):
+        style: dict[str, Any] = {"color": colour, "linestyle": line, "marker": mark}
+        left.loglog(sizes, [row[name] for row in rows], markersize=4, label=label, **style)
+    left.set(xlabel="rules", ylabel="µs per decision", title="time")
+    left.legend()
+    memory = [row["sga KiB"] for row in rows]
+    right.loglog(sizes, memory, "o-", color=figures.BLUE, markersize=4)
+    right.set(xlabel="rules", ylabel="KiB", title="parameters, traces and counters of SGA")
+    path.write_bytes(figures.png(figure, dpi=110))
 
 
 @arithmetic()

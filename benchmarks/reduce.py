@@ -125,7 +125,8 @@ def draw(found: list[Row], path: Path) -> None:
     """Steps, over those of the full policy, and success in the maze against the number of rules."""
     found = [row for row in found if row["task"] == MAZE]
     figure, (left, right) = figures.canvas(2, 3.6, 2.8)
-    for agent, (colour, line) in zip(NAMES, figures.SERIES, strict=False):
+    # Hollow marks of two sizes: equal values are seen in each other.
+    for agent, (colour, line), size in zip(NAMES, figures.SERIES, (7, 4), strict=False):
         ours = [row for row in found if row["agent"] == agent]
         full = {row["seed"]: row["steps"] for row in ours if not row["asked"]}
         asked = sorted({row["asked"] for row in ours if row["asked"]})
@@ -139,8 +140,9 @@ def draw(found: list[Row], path: Path) -> None:
             points.append((x, np.median(ratios), goal))
             left.plot([x] * len(ratios), ratios, "o", color=colour, ms=2.5, alpha=0.35, mew=0)
         x, steps, goals = np.array(points).T
-        left.plot(x, steps, color=colour, linestyle=line, label=NAMES[agent])
-        right.plot(x, 100 * goals, color=colour, linestyle=line, marker="o", ms=3)
+        mark = {"marker": "o" if agent == "sga" else "s", "mfc": "none", "ms": size}
+        left.plot(x, steps, color=colour, linestyle=line, label=NAMES[agent], **mark)
+        right.plot(x, 100 * goals, color=colour, linestyle=line, **mark)
     for ax in (left, right):
         ax.set(xscale="log", xlabel="rules")
         ax.set_xticks([5, 10, 20, 40, 100, 200, 400, 800], minor=False)

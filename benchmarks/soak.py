@@ -104,11 +104,11 @@ def report(samples: list[dict[str, float]], log: float, soak: Soak) -> None:
     (soak.out / f"soak-{soak.agent}.json").write_text(json.dumps(data))
     figure, (ax,) = figures.canvas(width=5, height=3)
     ax.plot(columns["steps"] / 1e6, columns["mebibytes"], color=figures.BLUE)
-    ax.set(xlabel="simulator steps [million]", ylabel="process memory [MiB] (blue)")
+    ax.set(xlabel="simulator steps [million]", ylabel="process memory [MiB] (solid)")
     ax.set_ylim(0, 1.15 * columns["mebibytes"].max())
     twin = ax.twinx()
     twin.plot(columns["steps"] / 1e6, columns["rules"], "--", color="0.6")
-    twin.set(ylabel="rules (grey, dashed)", ylim=(0, 1.3 * columns["rules"].max()))
+    twin.set(ylabel="rules (dashed)", ylim=(0, 1.3 * columns["rules"].max()))
     (soak.out / f"soak-{soak.agent}.png").write_bytes(figures.png(figure))
 
 

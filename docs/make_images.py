@@ -49,6 +49,7 @@ def main(options: Options) -> None:
         ax.imshow(picture, extent=(0, 1, 0, 1))
         ax.set_axis_off()
     figures.action_field(env.plan, agent, policy)
+    policy.set_axis_off()  # as large as the pictures beside it
     OUT.mkdir(exist_ok=True)
     (OUT / "learned.png").write_bytes(figures.png(figure, dpi=180))
     renderer.close()

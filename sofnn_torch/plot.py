@@ -5,8 +5,9 @@
     python -m sofnn_torch.plot RUN RUN --smooth 10 --csv curves.csv
 
 Runs that differ in nothing but their seed and their number of trials are one group: a line for the
-median over its seeds, a band from the first to the third quartile, and each seed faintly. The table
-is of the last 10 trials of each run. Runs that are still learning can be drawn.
+median over its seeds, a band from the first to the third quartile, and each seed faintly; of fewer
+than five seeds each is a line. The table is of the last 10 trials of each run. Runs that are still
+learning can be drawn.
 """
 
 import dataclasses

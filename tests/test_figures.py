@@ -136,14 +136,14 @@ def test_rule_map_shows_every_rule(plan, axes):
 
 
 def test_learning_curves_are_medians_of_the_common_trials(tmp_path, axes):
-    tables = [[900, 700, 500, 480], [1000, 600, 520], [800, 800, 510]]
+    tables = [[900, 700, 500, 480], [1000, 600, 520], [800, 800, 510], [850, 650, 400], [950] * 3]
     paths = []
     for i, steps in enumerate(tables):
         paths.append(tmp_path / f"{i}.csv")
         rows = [f"{t},{n},True" for t, n in enumerate(steps, 1)]
         paths[-1].write_text("\n".join(["trial,steps,success", *rows]) + "\n")
     figures.learning_curves({"SOFNN": paths}, axes, reference=("optimum", 470))
-    median = next(line for line in axes.lines if line.get_label() == "SOFNN (3 seeds)")
+    median = next(line for line in axes.lines if line.get_label() == "SOFNN (5 seeds)")
     assert median.get_xdata().tolist() == [1, 2, 3]
     assert median.get_ydata().tolist() == [900, 700, 510]
     assert [900, 700, 500, 480] in [list(line.get_ydata()) for line in axes.lines]
@@ -154,6 +154,16 @@ def test_learning_curves_are_medians_of_the_common_trials(tmp_path, axes):
         figures.read_column(paths[0], "rules")
     with pytest.raises(ValueError, match="at most 5 arms"):
         figures.learning_curves({str(i): paths for i in range(6)}, axes)
+
+
+def test_fewer_than_five_seeds_are_lines_without_a_median_or_a_band(axes):
+    few = [np.array([seed, 10.0 * seed]) for seed in (1, 2, 3, 4)]
+    figures.learning_curves({"few": few, "one": few[:1]}, axes, "rules")
+    assert [list(line.get_ydata()) for line in axes.lines] == [*map(list, few), [1, 10]]
+    assert not axes.collections and not axes.get_legend().get_title().get_text()
+    assert [text.get_text() for text in axes.get_legend().get_texts()] == ["few (4 seeds)", "one"]
+    figures.learning_curves({"many": [*few, few[0]]}, axes, "rules")
+    assert "band: quartiles" in axes.get_legend().get_title().get_text()
 
 
 def test_a_column_of_trials_is_read_as_resuming_reads_it(tmp_path):

@@ -20,6 +20,7 @@ from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties
 from matplotlib.legend import Legend
+from matplotlib.markers import MarkerStyle
 from matplotlib.patches import Circle, Rectangle
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import (
@@ -47,11 +48,15 @@ PURPLE, SKY, BLACK = "#CC79A7", "#56B4E9", "#000000"
 SERIES = [(BLUE, "-"), (VERMILION, "--"), (GREEN, "-."), (PURPLE, ":"), (BLACK, (0, (5, 1, 1, 1)))]
 DEPTHS = LinearSegmentedColormap.from_list("depths", ["white", SKY, "#409CD8"])  # low to high value
 TURNS = LinearSegmentedColormap.from_list("turns", [BLUE, BLACK, ORANGE])  # right, straight, left
+MARKS = ((BLUE, ">", "right turn"), (BLACK, "o", "straight"), (ORANGE, "<", "left turn"))
+FEWEST = 5  # seeds that quartiles can describe
+BAND = "line: median; band: quartiles; faint: each seed"
 STYLE: "dict[RcKeyType, Any]" = {
     "font.size": 9,
     "axes.titlesize": 9,
     "axes.labelsize": 9,
     "legend.fontsize": 8,
+    "legend.title_fontsize": 7,
     "legend.frameon": False,
     "xtick.labelsize": 8,
     "ytick.labelsize": 8,
@@ -170,9 +175,10 @@ def _legend_above(ax: Axes) -> Legend:
     )
 
 
-def _turn_legend(ax: Axes, symbol: str) -> Legend:
-    for colour, name in ((BLUE, "right turn"), (BLACK, "straight"), (ORANGE, "left turn")):
-        ax.plot([], [], symbol, color=colour, markersize=4, label=name)
+def _turn_legend(ax: Axes, line: str = "") -> Legend:
+    """What the colours mean, and the marks of a map of rules, which has no lines."""
+    for colour, mark, name in MARKS:
+        ax.plot([], [], line or mark, color=colour, markersize=4, label=name)
     return _legend_above(ax)
 
 
@@ -180,13 +186,13 @@ def _turn_legend(ax: Axes, symbol: str) -> Legend:
 def rule_map(
     plan: "MazePlan", agent: Learner, ax: Axes, weights: NDArray[Any] | None = None
 ) -> Legend:
-    """Every rule at its centre, a tick towards its heading, coloured by the action there.
+    """Every rule at its centre, a tick towards its heading, colour and mark of the action there.
 
     Args:
         plan: the maze.
         agent: the learner.
         ax: where to draw.
-        weights: a use of each rule (`usage`), which sets the size of its dot. Shape: (K,).
+        weights: a use of each rule (`usage`), which sets the size of its mark. Shape: (K,).
 
     Returns:
         The legend of the colours.
@@ -200,8 +206,11 @@ def rule_map(
         sizes = 2 + 18 * np.sqrt(weights / max(weights.max(), 1e-12))
     _headings(ax, centres, 0.02, colors=colours, linewidths=0.7, zorder=4)
     x, y = centres[:, :2].T
-    ax.scatter(x, y, s=sizes, c=colours, alpha=0.75, linewidths=0, zorder=4)
-    return _turn_legend(ax, "o")
+    dots = ax.scatter(x, y, s=sizes, c=colours, alpha=0.75, linewidths=0, zorder=4)
+    marks = [MarkerStyle(mark) for _, mark, _ in MARKS]
+    shapes = [mark.get_path().transformed(mark.get_transform()) for mark in marks]
+    dots.set_paths([shapes[i] for i in np.rint(np.clip(turn, -1, 1)).astype(int) + 1])
+    return _turn_legend(ax)
 
 
 @styled
@@ -411,6 +420,8 @@ def learning_curves(
 ) -> None:
     """Median and interquartile band over seeds for each arm, every seed drawn faintly.
 
+    Of fewer than five seeds, which no band describes, each seed is a line.
+
     Args:
         arms: name of each arm and the ``trials.csv`` of its seeds, or their columns (trials,);
             the shortest ends the median.
@@ -424,17 +435,25 @@ def learning_curves(
     """
     if len(arms) > len(SERIES):
         raise ValueError(f"at most {len(SERIES)} arms can be told apart, got {len(arms)}")
+    title = None
     for (name, runs), (colour, line) in zip(arms.items(), SERIES, strict=False):
         curves = [run if isinstance(run, np.ndarray) else read_column(run, column) for run in runs]
-        length = min(map(len, curves))
-        table, trials = np.array([c[:length] for c in curves]), np.arange(1, length + 1)
-        for curve in curves if len(curves) > 1 else ():
-            single: dict[str, Any] = {"color": colour, "linewidth": 0.4, "alpha": 0.3, "zorder": 2}
-            ax.plot(np.arange(1, len(curve) + 1), curve, **single)
-        low, median, high = np.quantile(table, [0.25, 0.5, 0.75], axis=0)
-        ax.fill_between(trials, low, high, color=colour, alpha=0.2, linewidth=0, zorder=3)
-        count = f"{name} ({len(curves)} seeds)" if len(curves) > 1 else name
-        ax.plot(trials, median, color=colour, linestyle=line, linewidth=1.4, label=count, zorder=4)
+        many = len(curves) >= FEWEST
+        single: dict[str, Any] = {"linestyle": line, "linewidth": 1, "zorder": 4}
+        if many:
+            single = {"linewidth": 0.4, "alpha": 0.3, "zorder": 2}
+        for curve in curves:
+            (drawn,) = ax.plot(np.arange(1, len(curve) + 1), curve, color=colour, **single)
+        if many:
+            length = min(map(len, curves))
+            table, trials = np.array([c[:length] for c in curves]), np.arange(1, length + 1)
+            low, median, high = np.quantile(table, [0.25, 0.5, 0.75], axis=0)
+            ax.fill_between(trials, low, high, color=colour, alpha=0.2, linewidth=0, zorder=3)
+            (drawn,) = ax.plot(
+                trials, median, color=colour, linestyle=line, linewidth=1.4, zorder=4
+            )
+            title = BAND
+        drawn.set_label(f"{name} ({len(curves)} seeds)" if len(curves) > 1 else name)
     if reference is not None:
         ax.axhline(reference[1], color="0.3", linewidth=0.8, linestyle=(0, (1, 2)))
         place = {"xycoords": ("axes fraction", "data"), "ha": "right", "va": "top"}
@@ -446,7 +465,7 @@ def learning_curves(
     ax.set(xlabel="trial", ylabel=label)
     ax.xaxis.set_major_locator(MaxNLocator("auto", steps=[1, 2, 2.5, 5, 10], integer=True))
     ax.margins(x=0.01)
-    ax.legend()
+    ax.legend(title=title, alignment="left")
 
 
 @styled

@@ -14,6 +14,7 @@ from sofnn_torch.maze.plan import MazePlan
 from sofnn_torch.maze.rendering import OffscreenRenderer, RenderingError
 from sofnn_torch.maze.robot import Physics, load_model, plan_of
 from sofnn_torch.pictures import figures
+from sofnn_torch.plot import smoothed
 from sofnn_torch.runs.trial import Trajectory
 from sofnn_torch.studies.results import Data
 from sofnn_torch.studies.studies import STUDIES
@@ -21,7 +22,8 @@ from sofnn_torch.terminal import say
 
 AGENTS = {"sga": "SGA", "q": "Q-learning"}
 NETWORKS = {"sofnn": "SOFNN", "fixed": "FSFNN"}
-BAND = "Line: median over the seeds; band: interquartile range; faint: each seed."
+FIRST = 50  # trials that are drawn enlarged
+WINDOW = 10  # trials of a success rate
 LIMIT = "A trial that ends without the goal counts with its limit."
 MARKERS = [("o", 7), ("s", 4), ("^", 5), ("D", 2)]  # hollow: equal values are seen in each other
 Caption = tuple[str, str]  # file without suffix, text
@@ -68,11 +70,12 @@ def _of_the_paper(data: Data) -> Iterator[tuple[str, Figure | None, str]]:
     for number, agent in ((7, "sga"), (8, "q")):
         names = {text: f"{agent}-{network}-estimated" for network, text in NETWORKS.items()}
         if arms := _curves(data, names):
-            figure, (ax,) = figures.canvas(width=5, height=3.3)
-            figures.learning_curves(arms, ax, reference=optimum)
-            _legend_above(ax)
-            text = f"Fig. {number}: steps to the goal, {AGENTS[agent]}, estimated pose. {BAND} "
-            yield f"fig{number}", figure, text + LIMIT + _diverged(data, names)
+            limit = data.info["arms"][names["SOFNN"]]["config"]["maze"]["max_steps"]
+            text = f"Fig. {number}: steps to the goal, {AGENTS[agent]}, estimated pose. "
+            text += f"{_bands(arms)} {LIMIT} Right: the share of the seeds that reach the goal, "
+            text += f"mean of the last {WINDOW} trials."
+            figure = learning(arms, optimum, limit)
+            yield f"fig{number}", figure, text + _diverged(data, names)
     names = {
         f"{AGENTS[agent]}, {text}": f"{agent}-{network}-estimated"
         for agent in AGENTS
@@ -84,7 +87,7 @@ def _of_the_paper(data: Data) -> Iterator[tuple[str, Figure | None, str]]:
         ax.yaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
         ax.set_ylim(bottom=0)
         _legend_above(ax)
-        text = f"Fig. 9: number of rules after each trial, estimated pose. {BAND}"
+        text = f"Fig. 9: number of rules after each trial, estimated pose. {_bands(arms)}"
         yield "fig9", figure, text + _diverged(data, names)
     poses = {
         agent: {f"{pose} pose": f"{agent}-sofnn-{pose}" for pose in ("estimated", "true")}
@@ -96,9 +99,11 @@ def _of_the_paper(data: Data) -> Iterator[tuple[str, Figure | None, str]]:
         for ax, (agent, arms) in zip(axes, panels.items(), strict=True):
             figures.learning_curves(arms, ax, reference=optimum)
             _legend_above(ax, columns=1)
-            ax.set_title(f"{AGENTS[agent]}, SOFNN", y=1.18)
+            ax.set_title(f"{AGENTS[agent]}, SOFNN", y=1.27)
         axes[1].sharey(axes[0])
-        text = f"Fig. 10: steps to the goal with estimated and true pose. {BAND} {LIMIT}"
+        every = [*panels["sga"].values(), *panels["q"].values()]
+        bands = _bands(dict(enumerate(every)))
+        text = f"Fig. 10: steps to the goal with estimated and true pose. {bands} {LIMIT}"
         names = {f"{AGENTS[a]}, {t}": arm for a, arms in poses.items() for t, arm in arms.items()}
         yield "fig10", figure, text + _diverged(data, names)
     paths = {agent: last_paths(data, f"{agent}-sofnn-estimated") for agent in AGENTS}
@@ -107,6 +112,10 @@ def _of_the_paper(data: Data) -> Iterator[tuple[str, Figure | None, str]]:
         for ax, (agent, found) in zip(axes, paths.items(), strict=True):
             pose_errors(found, ax, plan)
             ax.set_title(f"{AGENTS[agent]}, SOFNN", y=1.1)
+        shown = [ax for ax, found in zip(axes, paths.values(), strict=True) if found]
+        right, top = (max(get(ax)[1] for ax in shown) for get in (Axes.get_xlim, Axes.get_ylim))
+        for ax in shown:
+            ax.set(xlim=(0, right), ylim=(0, top))
         yield (
             "fig11",
             figure,
@@ -117,10 +126,54 @@ def _of_the_paper(data: Data) -> Iterator[tuple[str, Figure | None, str]]:
         )
 
 
+@figures.styled
+def learning(arms: dict[str, Any], optimum: tuple[str, float], limit: int) -> Figure:
+    """Steps of all trials, before them those of the first enlarged, and how many seeds arrive."""
+    enlarged = max(len(run) for runs in arms.values() for run in runs) > FIRST
+    figure, axes = figures.canvas(2 + enlarged, width=3, height=3.1)
+    *steps, every, reached = axes
+    for first in steps:
+        begin = {name: [run[:FIRST] for run in runs] for name, runs in arms.items()}
+        figures.learning_curves(begin, first, reference=optimum)
+        first.set_title(f"the first {FIRST} trials")
+        every.sharey(first)
+    figures.learning_curves(arms, every, reference=optimum)
+    success_rates(arms, reached, limit)
+    title = legend.get_title().get_text() if (legend := every.get_legend()) else ""
+    lines, names = every.get_legend_handles_labels()
+    figure.legend(lines, names, loc="outside upper left", ncols=4, title=title, alignment="left")
+    for ax in axes:
+        if legend := ax.get_legend():
+            legend.remove()
+    return figure
+
+
+def success_rates(arms: dict[str, Any], ax: Axes, limit: int) -> None:
+    """Share of the seeds whose trials end before the limit, mean of the last ten trials."""
+    for (_, runs), (colour, line) in zip(arms.items(), figures.SERIES, strict=False):
+        length = min(map(len, runs))
+        share = np.mean([run[:length] < limit for run in runs], axis=0)
+        rate = 100 * smoothed(share, WINDOW)
+        ax.plot(np.arange(1, length + 1), rate, color=colour, linestyle=line, linewidth=1.4)
+    ax.set(xlabel="trial", ylabel="seeds that reach the goal [%]", ylim=(0, 103))
+
+
+def _bands(arms: dict[Any, Any]) -> str:
+    """What the lines of learning curves are, for a caption."""
+    few = [len(runs) < figures.FEWEST for runs in arms.values()]
+    single = "Each line is a seed."
+    if all(few):
+        return single
+    band = f"{figures.BAND[0].upper()}{figures.BAND[1:]}."
+    return f"{band} Of fewer than {figures.FEWEST} seeds each is a line." if any(few) else band
+
+
 def _legend_above(ax: Axes, columns: int = 2) -> None:
     """Where it covers nothing; matplotlib's search for such a place is slow with many curves."""
+    place: dict[str, Any] = {"loc": "lower left", "bbox_to_anchor": (0, 1), "borderaxespad": 0.2}
+    title = ax.get_legend().get_title().get_text()
     with matplotlib.rc_context(figures.STYLE):
-        ax.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=columns, borderaxespad=0.2)
+        ax.legend(ncols=columns, title=title, alignment="left", **place)
 
 
 def _diverged(data: Data, names: dict[str, str]) -> str:
