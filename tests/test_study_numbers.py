@@ -500,3 +500,12 @@ def test_the_greedy_policy_is_evaluated_without_chance_and_the_last_path_is_kept
     assert played == [(running.EPISODES, explore, 1007, plain) for explore, plain in each]
     assert [data[name][0]["steps"] for name in ("greedy", "plain", "sampled")] == [1, 3, 2]
     assert data["last_trial"] == {"steps": 9, "true": [[1, 2, 3]], "estimated": [[4, 5, 6]]}
+
+
+def test_success_rates_are_shares_of_the_seeds_averaged_over_the_last_trials():
+    _, (ax,) = figures.canvas()
+    runs = [np.array([20, 20, 5.0]), np.array([20, 5, 5.0, 5])]
+    drawing.success_rates({"arm": runs}, ax, limit=20)
+    (line,) = ax.lines
+    assert line.get_xdata().tolist() == [1, 2, 3]
+    assert line.get_ydata() == pytest.approx([0, 25, 50])  # means of 0, 1/2 and 1

@@ -139,9 +139,10 @@ def learning(arms: dict[str, Any], optimum: tuple[str, float], limit: int) -> Fi
         every.sharey(first)
     figures.learning_curves(arms, every, reference=optimum)
     success_rates(arms, reached, limit)
-    title = legend.get_title().get_text() if (legend := every.get_legend()) else ""
     lines, names = every.get_legend_handles_labels()
-    figure.legend(lines, names, loc="outside upper left", ncols=4, title=title, alignment="left")
+    figure.legend(
+        lines, names, loc="outside upper left", ncols=4, title=_title(every), alignment="left"
+    )
     for ax in axes:
         if legend := ax.get_legend():
             legend.remove()
@@ -168,10 +169,16 @@ def _bands(arms: dict[Any, Any]) -> str:
     return f"{band} Of fewer than {figures.FEWEST} seeds each is a line." if any(few) else band
 
 
+def _title(ax: Axes) -> str:
+    """Of a legend: what line and band are."""
+    legend = ax.get_legend()
+    return legend.get_title().get_text() if legend else ""
+
+
 def _legend_above(ax: Axes, columns: int = 2) -> None:
     """Where it covers nothing; matplotlib's search for such a place is slow with many curves."""
     place: dict[str, Any] = {"loc": "lower left", "bbox_to_anchor": (0, 1), "borderaxespad": 0.2}
-    title = ax.get_legend().get_title().get_text()
+    title = _title(ax)
     with matplotlib.rc_context(figures.STYLE):
         ax.legend(ncols=columns, title=title, alignment="left", **place)
 
