@@ -87,3 +87,11 @@ def test_a_reward_and_an_observation_of_ones_own(capsys):
     assert seen in env.observation_space and reward == pytest.approx(math.cos(seen[0]), abs=1e-6)
     parts["main"](trials=2)
     assert capsys.readouterr().out.startswith("mean height -")
+
+
+def test_an_agent_of_stable_baselines3_learns_in_the_maze(capsys):
+    pytest.importorskip("stable_baselines3", reason="needs pip install -e '.[peers]'")
+    example("sb3_maze")["main"](decisions=500, trials=1)
+    assert re.match(
+        r"mean return -?\d+ untrained, -?\d+ after 500 decisions\n", capsys.readouterr().out
+    )
