@@ -4,6 +4,7 @@ import ast
 import json
 import os
 import re
+import runpy
 import subprocess
 import sys
 import sysconfig
@@ -33,10 +34,7 @@ def run(*command, cwd, **variables):
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory):
     folder = tmp_path_factory.mktemp("wheel")
-    run(
-        *(sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", folder, ROOT),
-        cwd=folder,
-    )
+    run(*(sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", folder), cwd=ROOT)
     (file,) = folder.glob("*.whl")
     return file
 
@@ -49,7 +47,7 @@ def home(wheel, tmp_path_factory):
     python = folder / "venv" / "bin" / "python"
     run(
         *(sys.executable, "-m", "pip", "--python", python, "install", "--quiet"),
-        *("--no-deps", "--no-index", wheel),
+        *("--no-deps", "--no-index", "--no-compile", wheel),
         cwd=folder,
     )
     site = next((folder / "venv" / "lib").glob("python*")) / "site-packages"
@@ -82,21 +80,54 @@ def test_the_wheel_holds_the_assets_and_its_types_and_no_tests(wheel):
 
 def test_the_installed_package_trains_and_evaluates_elsewhere(home):
     scripts = home / "venv" / "bin"
-    look = (
-        "import gymnasium, sofnn_torch; print(sofnn_torch.__file__);"
-        "env = gymnasium.make('sofnn_torch:KheperaMaze-v0'); print(env.reset(seed=0)[0].shape)"
-    )
-    place, shape = run(scripts / "python", "-c", look, cwd=home).split("\n", 1)
-    assert Path(place).is_relative_to(home)
-    assert shape.strip() == "(3,)"
     flags = ["--trials", "2", "--maze.max-steps", "100", "--quiet"]
     run(scripts / "sofnn-train", *flags, cwd=home)
     (directory,) = (home / "runs").iterdir()
-    table = run(
-        scripts / "sofnn-evaluate", directory, "--episodes", "2", "--json", "r.json", cwd=home
-    )
-    assert "2 trials learned" in table
+    look = f"""
+import sys
+from importlib.metadata import entry_points
+import gymnasium, sofnn_torch
+print(sofnn_torch.__file__)
+print(gymnasium.make("sofnn_torch:KheperaMaze-v0").reset(seed=0)[0].shape)
+for command in entry_points(group="console_scripts"):
+    if command.name.startswith("sofnn-"):
+        print(command.name, callable(command.load()))
+sys.argv = ["sofnn-evaluate", {str(directory)!r}, "--episodes", "2", "--json", "r.json"]
+(evaluate,) = entry_points(group="console_scripts", name="sofnn-evaluate")
+sys.exit(evaluate.load()())
+"""
+    place, shape, *rest = run(scripts / "python", "-c", look, cwd=home).splitlines()
+    assert Path(place).is_relative_to(home) and shape == "(3,)"
+    names = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
+    assert {f"{name} True" for name in names} <= set(rest)
+    assert all((scripts / name).exists() for name in names)
+    assert any("2 trials learned" in line for line in rest)
     assert len(json.loads((home / "r.json").read_text())["trials"]) == 2
+
+
+RELATIVE = re.compile(r"\]\((?!https?:|#)([^)\s]+)\)")
+
+
+def test_a_package_index_is_shown_no_relative_link_or_picture(wheel):
+    files = zipfile.ZipFile(wheel)
+    (name,) = (name for name in files.namelist() if name.endswith(".dist-info/METADATA"))
+    text = files.read(name).decode()
+    assert "Description-Content-Type: text/markdown" in text and "## Two commands" in text
+    assert RELATIVE.findall(text) == []
+
+
+def test_links_and_pictures_take_the_address_of_the_repository():
+    text, pages = (ROOT / "README.md").read_text(), runpy.run_path(str(ROOT / "hatch_build.py"))
+    paths, plain = RELATIVE.findall(text), pages["for_index"](text)
+    assert RELATIVE.findall(plain) == [] and "](https://mujoco.org)" in plain
+    assert "![" not in plain and "Four trials of one run" not in plain
+    full = pages["for_index"](text, "https://host.example/us/it/")
+    assert RELATIVE.findall(full) == []
+    found = re.findall(
+        r"(!?)\[[^\]]*\]\(https://host.example/us/it/(raw|blob)/HEAD/([^)]+)\)", full
+    )
+    assert sorted(path for *_, path in found) == sorted(paths)
+    assert all((kind == "raw") == bool(mark) for mark, kind, _ in found)
 
 
 @pytest.mark.slow
@@ -167,9 +198,3 @@ def test_the_network_and_the_learners_load_without_the_simulator():
     names = "SOFNN, grid, Axis, SGA, QLearning, Task"
     code = f"from sofnn_torch import {names}; import sys; print({{{heavy}}} & {{*sys.modules}})"
     assert python(code) == (0, "set()", "")
-
-
-def test_a_simulator_that_does_not_load_is_an_import_error_that_can_be_caught():
-    code = "try:\n import sofnn_torch.training\nexcept ImportError as e:\n print(e)\nprint('on')"
-    code, out, _ = python(code, MUJOCO_GL="nonsense")
-    assert code == 0 and "MUJOCO_GL=nonsense" in out and out.endswith("on")
