@@ -133,13 +133,23 @@ def test_a_reader_that_leaves_early_is_no_error(here):
     assert child.wait(timeout=120) == 0
 
 
-def test_a_bad_mujoco_gl_is_one_line(here):
-    command = [sys.executable, str(ROOT / "train.py"), "--trials", "1"]
+def test_a_bad_mujoco_gl_is_one_line_and_an_import_error_that_can_be_caught(here):
+    code = f"""
+import runpy, sys
+try:
+    import sofnn_torch.training
+except ImportError as error:
+    print("caught:", error)
+sys.argv = ["train.py", "--trials", "1"]
+runpy.run_path({str(ROOT / "train.py")!r}, run_name="__main__")
+"""
+    command = [sys.executable, "-c", code]
     environment = os.environ | {"MUJOCO_GL": "nonsense"}
     done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=120)
     assert done.returncode == 2 and not contents(here)
     (line,) = done.stderr.splitlines()
     assert "MUJOCO_GL=nonsense" in line and "egl, osmesa or glfw" in line
+    assert re.match("caught: .*MUJOCO_GL=nonsense", done.stdout)
 
 
 def test_what_an_encoding_lacks_prints_as_question_marks(monkeypatch):
@@ -198,7 +208,7 @@ def test_a_learning_rate_of_a_thousand_ends_in_a_message(rate, here, capsys):
 @pytest.mark.parametrize("preset", ["default", "paper"])
 def test_the_presets_stay_within_the_limits_of_the_guard(agent, preset, here, capsys):
     words = ["--agent", agent, "--preset", preset, "--trials", "2", *QUICK]
-    assert main([*words, "--maze.max-steps=2000"]) == 0
+    assert main([*words, "--maze.max-steps=1000"]) == 0
     assert not capsys.readouterr().err
 
 
