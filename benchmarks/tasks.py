@@ -64,15 +64,17 @@ def settings(env: str, agent: str, seed: int, replay: bool) -> Config:
     config = Config(env=env, agent=agent, seed=seed, trials=100_000)
     if replay:
         return config
-    learner = dataclasses.replace(getattr(config, agent), replays=0)
+    learner = dataclasses.replace(getattr(config, agent), replays=0, replay_every=0)
     return dataclasses.replace(config, **{agent: learner})
 
 
 def learned(config: Config, steps: int, run: Path) -> dict[str, float]:
     """Train a run to so many environment steps and play it: steps, rules, seconds, mean return."""
     known = run / "played.json"
+    found: dict[str, float]
     if known.exists():
-        return json.loads(known.read_text())
+        found = json.loads(known.read_text())
+        return found
     shutil.rmtree(run, ignore_errors=True)  # it was cut short
 
     def over(record: TrialRecord) -> bool:

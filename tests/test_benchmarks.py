@@ -202,3 +202,9 @@ def test_growth_and_grid_are_searched_alike_and_compared_on_other_seeds(monkeypa
     assert len(text) == 4 and "80-84" in text[2] and "(9 x 9)" in text[3]
     growth.draw([row], tmp_path / "growth.png")
     assert (tmp_path / "growth.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_page_of_tasks_has_the_table_of_what_was_measured():
+    root = Path(__file__).parents[1]
+    cells = json.loads((root / "docs" / "results" / "tasks.json").read_text())
+    assert cells and tasks.table(cells) in (root / "docs" / "tasks.md").read_text()

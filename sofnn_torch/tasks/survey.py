@@ -47,7 +47,8 @@ def explored(env: TaskEnv, found: Spaces, seed: int) -> Spaces:
     """The spaces of an environment, with what `STEPS` steps of random play say of it."""
     states, rewards = play_at_random(env, seed)
     axes = tuple(map(within, found.axes, states.min(0).tolist(), states.max(0).tolist()))
-    tuned = {"q": optimism(rewards)} if found.reward_scale is None else found.tuned
+    known = found.reward_scale is not None
+    tuned = found.tuned if known else {"q": optimism(rewards)}
     return replace(found, axes=axes, reward_scale=scale(rewards), tuned=tuned)
 
 
