@@ -23,6 +23,7 @@ from sofnn_torch.studies.statistics import median, ratio, share
 from sofnn_torch.studies.studies import STUDIES
 from sofnn_torch.terminal import say
 
+RESULTS = Path("docs/results")
 NOTES = """\
 Cells are medians over the seeds, with the 95 % interval of a percentile bootstrap over seeds in
 brackets; of fewer than five seeds, which no interval describes, the values themselves. Success is
@@ -233,16 +234,19 @@ def write(out: Path) -> int:
         count = "-".join(map(str, seeds[:: max(1, len(seeds) - 1)]))
         link = f"[{data.info['title']}]({name}.md)"
         index.append([link, str(len(data.info["arms"])), count, _commands(data.info)])
+    where = "" if out.resolve() == RESULTS.resolve() else f" --out {out}"
     text = (
         "# Results\n\nEvery table and figure here is written by a command, from the data beside "
-        "it. `python -m sofnn_torch.studies --report-only` writes them anew without running "
-        "anything.\n\n"
+        f"it. `python -m sofnn_torch.studies --report-only{where}` writes them anew without "
+        "running anything.\n\n"
     )
     text += markdown(["study", "arms", "seeds of an arm", "command"], index, 4)
     more = [path for name in ("peers", "change") if (path := out / f"{name}.md").exists()]
     if more:
         titles = (f"[{path.read_text().splitlines()[0][2:]}]({path.name})" for path in more)
         text += f"\n\nMade by commands of their own: {', '.join(titles)}."
+    if (out / "earlier").exists():
+        text += "\n\nOf earlier code, which told the robot more: [earlier](earlier/README.md)."
     (out / "README.md").write_text(text + "\n")
     say(f"written: {out}/README.md and the pages of {', '.join(names)}")
     return 0
