@@ -7,7 +7,7 @@ import pytest
 
 from sofnn_torch.maze.robot import Physics, plan_of
 from sofnn_torch.runs.settings import Config
-from sofnn_torch.studies import change
+from sofnn_torch.studies import change, peers
 from sofnn_torch.studies.peers import Trial
 from sofnn_torch.studies.results import read_table
 
@@ -18,7 +18,7 @@ SHORT = {"before": 1, "during": 1, "after": 1, "max_steps": 60, "workers": 1}
 @pytest.fixture(autouse=True)
 def quick(monkeypatch):
     """Without the search for the optimum, and few greedy trials."""
-    monkeypatch.setattr(change, "optimum", lambda layout: 468.0)
+    monkeypatch.setattr(peers, "optimum", lambda layout: 468.0)
     monkeypatch.setattr(change, "PLAYED", 2)
 
 

@@ -12,7 +12,6 @@ what was learned in A. Learners are told nothing of a change.
 
 import copy
 import dataclasses
-import functools
 import json
 import os
 import signal
@@ -30,14 +29,12 @@ if __name__ == "__main__":  # Ctrl-C while libraries load
 from sofnn_torch import terminal
 from sofnn_torch.bounds import Count, Settings
 from sofnn_torch.maze.layouts import STANDARD, standard_path
-from sofnn_torch.maze.optimum import mean_optimum
-from sofnn_torch.maze.robot import plan_of
 from sofnn_torch.runs import parallel, seeding
 from sofnn_torch.runs.factory import make_agent, make_env
 from sofnn_torch.runs.session import arithmetic
 from sofnn_torch.runs.settings import Config
-from sofnn_torch.studies.collecting import IN_A_ROW, WITHIN, trials_to_learn
-from sofnn_torch.studies.peers import Trial, play
+from sofnn_torch.studies.collecting import IN_A_ROW, WITHIN
+from sofnn_torch.studies.peers import Trial, learned, play
 from sofnn_torch.studies.results import NEVER, cell, markdown, read_table, write_table
 from sofnn_torch.studies.statistics import median, share
 from sofnn_torch.studies.tiles import TileCoder, TileConfig
@@ -104,12 +101,6 @@ def world(config: Config, change: str | None) -> Config:
     return dataclasses.replace(config, maze=maze)
 
 
-@functools.cache
-def optimum(layout: str) -> float:
-    """The fewest steps in a maze, with actions held as in training."""
-    return mean_optimum(plan_of(layout))
-
-
 def phase(config: Config, agent: Any, trials: int, seed: int) -> list[Trial]:
     """Trials of learning in one world."""
     env: Any = make_env(config)
@@ -130,8 +121,7 @@ def arrives(config: Config, agent: Any, seed: int) -> tuple[int, float]:
 
 def recovered(trials: list[Trial], layout: str) -> float:
     """Trials before the first ten good ones in a row; NaN if there are none."""
-    steps, success = zip(*((t.steps, t.success) for t in trials), strict=True)
-    return trials_to_learn(steps, success, optimum(layout)) - IN_A_ROW
+    return learned(trials, layout) - IN_A_ROW
 
 
 @arithmetic()
@@ -150,7 +140,7 @@ def lives(learner: str, seed: int, options: Options) -> list[dict[str, Any]]:
         agent = TileCoder(TileConfig(), env.unwrapped.axes, 3, seed)
         env.close()
     first = phase(config, agent, options.before, seeding.stream("training", seed))
-    learned = arrives(config, agent, seed)
+    before = arrives(config, agent, seed)
     rows = []
     for number, change in enumerate(options.changes):
         alive, other = copy.deepcopy(agent), world(config, change)
@@ -166,8 +156,8 @@ def lives(learner: str, seed: int, options: Options) -> list[dict[str, Any]]:
                 "change": change,
                 "seed": seed,
                 "trials": f"{options.before} {options.during} {options.after}",
-                "learned": learned[0],
-                "trials_to_learn": recovered(first, STANDARD) + IN_A_ROW,
+                "learned": before[0],
+                "trials_to_learn": learned(first),
                 "at_once": at_once[0],
                 "recovered": recovered(second, other.maze.layout),
                 "changed": there[0],

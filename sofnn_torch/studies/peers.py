@@ -174,15 +174,16 @@ def learn(
     return trials, greedy, begin
 
 
-def learned(trials: list[Trial]) -> float:
-    """The trial that completes the first ten good ones in a row, or NaN."""
+def learned(trials: list[Trial], layout: str = STANDARD) -> float:
+    """The trial that completes the first ten good ones in a row in a maze, or NaN."""
     steps, success = zip(*((t.steps, t.success) for t in trials), strict=True)
-    return trials_to_learn(steps, success, _optimum())
+    return trials_to_learn(steps, success, optimum(layout))
 
 
 @functools.cache
-def _optimum() -> float:
-    return mean_optimum(plan_of(STANDARD))
+def optimum(layout: str) -> float:
+    """The fewest steps in a maze, with actions held as in training."""
+    return mean_optimum(plan_of(layout))
 
 
 def search(learner: str, options: Options) -> tuple[dict[str, Any], list[dict[str, Any]]]:
