@@ -1,7 +1,7 @@
 """What a cluster costs: throughput of n workers, time that a job takes beyond its work, memory.
 
     python benchmarks/cluster.py                     # sleeping jobs on 1 to 32 workers; 1,000 jobs
-    python benchmarks/cluster.py --seeds 4           # and trainings on one worker and on two
+    python benchmarks/cluster.py --trainings         # equal trainings on one core and on two
 
 A real Dask scheduler and real workers on this machine. Sleeping jobs stand for workers on other
 machines: a process that sleeps in the place of one that trains, so that only the machinery is
@@ -9,6 +9,7 @@ measured. Memory is that of the client, the scheduler and the worker, sampled wh
 """
 
 import contextlib
+import dataclasses
 import json
 import os
 import subprocess
@@ -18,6 +19,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import psutil
 import tyro
@@ -25,7 +27,6 @@ import tyro
 from sofnn_torch.progress import Progress
 from sofnn_torch.runs import parallel
 from sofnn_torch.runs.jobs import Job
-from sofnn_torch.runs.session import RunOptions
 from sofnn_torch.runs.settings import Config
 from sofnn_torch.runs.signals import SignalTrap
 
@@ -53,8 +54,8 @@ class Options:
     """Sleeping jobs for each worker."""
     many: int = 1000
     """Short jobs, while memory is sampled; 0 for none."""
-    seeds: int = 0
-    """Trainings on one worker and on two; 0 for none."""
+    trainings: bool = False
+    """Equal trainings on one core and on two instead, which means something on an idle machine."""
     trials: int = 20
     """Trials of each training."""
     out: Path | None = None
@@ -82,16 +83,22 @@ def cluster(workers: int, folder: Path, *words: str) -> Iterator[tuple[str, list
         yield json.loads(file.read_text())["address"], [psutil.Process(), *processes]
 
 
+def done(jobs: list[Job], workers: int, address: str | None) -> Iterator[Job]:
+    """Do the jobs, here or on a cluster; each when it is done."""
+    with SignalTrap() as trap:
+        bar = Progress("jobs", 0, quiet=True)
+        for job, code, message in parallel.together(jobs, workers, bar, trap, address):
+            if code:
+                raise RuntimeError(f"{job.name}: {message}")
+            yield job
+
+
 def passed(jobs: list[Job], address: str, processes: list[psutil.Process]) -> list[tuple]:
     """Do the jobs: for each when it was done [s], and the memory of the processes [MB]."""
     begin, samples = time.perf_counter(), []
-    with SignalTrap() as trap:
-        bar = Progress("jobs", 0, quiet=True)
-        for job, code, message in parallel.together(jobs, 1, bar, trap, address):
-            if code:
-                raise RuntimeError(f"{job.name}: {message}")
-            memory = [process.memory_info().rss / 1e6 for process in processes]
-            samples.append((time.perf_counter() - begin, *memory))
+    for _ in done(jobs, 1, address):
+        memory = [process.memory_info().rss / 1e6 for process in processes]
+        samples.append((time.perf_counter() - begin, *memory))
     return samples
 
 
@@ -117,8 +124,8 @@ def overhead(folder: Path) -> dict[str, float]:
     os.environ["PYTHONPATH"] = f"{HOME}:{folder}"
     jobs = [Job(str(i), folder / "nothing" / str(i), "nothing:work") for i in range(12)]
     with cluster(1, folder) as (address, processes):
-        done = [time for time, *_ in passed(jobs, address, processes)]
-    through = (done[-1] - done[1]) / (len(done) - 2)  # the first is on its way when they begin
+        times = [time for time, *_ in passed(jobs, address, processes)]
+    through = (times[-1] - times[1]) / (len(times) - 2)  # the first is on its way when they begin
     begin = time.perf_counter()
     for _ in jobs:
         command = [sys.executable, "-c", "import sofnn_torch.terminal"]
@@ -150,22 +157,44 @@ def _line(at: int, sample: tuple) -> str:
     )
 
 
-def trainings(options: Options, folder: Path) -> list[dict[str, float]]:
-    """Seconds for the same seeds on one worker and on two, here and through the cluster."""
-    rows = []
-    config, listed = Config(agent="q", trials=options.trials), f"0-{options.seeds - 1}"
-    for how in ("here", "cluster"):
+def trainings(options: Options, folder: Path) -> list[dict[str, Any]]:
+    """Seconds of equal trainings, two for each worker: bare processes, `--workers`, the cluster."""
+    config = dataclasses.asdict(Config(agent="q", trials=options.trials))
+    keeping = {"picture_every": 0, "quiet": True}
+    arguments = {"config": config, "options": keeping}
+    rows: list[dict[str, Any]] = []
+    for how in ("bare", "here", "cluster"):
         for workers in (1, 2):
-            keeping = RunOptions(folder / f"{how}-{workers}", picture_every=0, quiet=True)
-            with cluster(workers, folder) as (address, _):
-                where = address if how == "cluster" else None
-                begin = time.perf_counter()
-                if parallel.train(config, keeping, listed, workers, where):
-                    raise RuntimeError("a seed failed")
-                took = time.perf_counter() - begin
+            place = folder / f"{how}-{workers}"
+            place.mkdir()
+            names = [str(i) for i in range(2 * workers)]
+            begin = time.perf_counter()
+            if how == "bare":
+                bare(names, workers, place, options.trials)
+            else:
+                jobs = [Job(i, place / i, parallel.WORK, arguments) for i in names]
+                with contextlib.ExitStack() as stack:
+                    where = None
+                    if how == "cluster":
+                        where, _ = stack.enter_context(cluster(workers, folder))
+                    begin = time.perf_counter()
+                    list(done(jobs, workers, where))
+            took = time.perf_counter() - begin
             rows.append({"how": how, "workers": workers, "seconds": took})
-            print(f"{how}, {workers} at a time: {took:.1f} s", flush=True)
+            efficiency = rows[-workers]["seconds"] / took
+            print(f"{how}, {workers} at a time: {took:.1f} s, efficiency {efficiency:.2f}")
     return rows
+
+
+def bare(names: list[str], workers: int, place: Path, trials: int) -> None:
+    """The same trainings with nothing of ours around them: what the machine itself allows."""
+    flags = f"--agent q --trials {trials} --picture-every 0 --quiet --runs {place}".split()
+    for at in range(0, len(names), workers):
+        some = names[at : at + workers]
+        command = [sys.executable, str(HOME / "train.py"), *flags, "--name"]
+        running = [subprocess.Popen([*command, name], stdout=subprocess.DEVNULL) for name in some]
+        if any(process.wait() for process in running):
+            raise RuntimeError("a training failed")
 
 
 def main() -> None:
@@ -174,12 +203,11 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         (folder / "asleep.py").write_text(SLEEP)
-        found = {
-            "overhead": overhead(folder),
-            "sleeping": sleeping(options, folder),
-            "memory": memory(options, folder) if options.many else [],
-            "trainings": trainings(options, folder) if options.seeds else [],
-        }
+        if options.trainings:
+            found: dict[str, Any] = {"trainings": trainings(options, folder)}
+        else:
+            found = {"overhead": overhead(folder), "sleeping": sleeping(options, folder)}
+            found["memory"] = memory(options, folder) if options.many else []
     if options.out:
         options.out.write_text(json.dumps(found))
 

@@ -10,7 +10,7 @@ import torch
 from conftest import contents, parameters, quick_options, settings, written
 
 from sofnn_torch import SOFNN, cli, evaluate, training
-from sofnn_torch.runs import checkpoint, rule_files
+from sofnn_torch.runs import checkpoint, rule_files, session
 from sofnn_torch.runs.directory import load_config
 from sofnn_torch.runs.factory import make_agent
 from sofnn_torch.runs.settings import Config, from_dict
@@ -28,6 +28,18 @@ def test_ten_rules_by_hand_drive_to_the_goal_in_every_trial(agent):
     config = Config(agent=agent, rules=RULES / f"{agent}.csv")
     records = evaluate.evaluate(config, make_agent(config), 4)
     assert all(record.success and record.steps < 620 for record in records)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("agent", ["sga", "q"])
+@pytest.mark.parametrize("seed", range(5))
+def test_learning_on_from_ten_rules_never_loses_the_way(agent, seed):
+    """Trials 2 to 10 are at most twice as long as the first, and all arrive."""
+    learner, env = session.build(
+        Config(agent=agent, rules=RULES / f"{agent}.csv", seed=seed, trials=10)
+    )
+    steps = [training.play(env, learner)[0].steps for _ in range(10)]
+    assert steps[0] < 700 and max(steps) <= 2 * steps[0]
 
 
 def test_settings_hold_the_rules_themselves():
