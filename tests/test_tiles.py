@@ -49,7 +49,7 @@ def test_values_of_a_corridor_are_those_of_dynamic_programming(watkins):
 
 
 def test_traces_are_one_where_the_action_was_taken_and_fade():
-    settings = TileConfig(tilings=1, tiles=(4,), trace_decay=0.5, gamma=0.8, initial=0.0)
+    settings = TileConfig(1, (4,), rate=0.5, trace_decay=0.5, gamma=0.8, initial=0.0)
     agent = TileCoder(settings, LINE, actions=1)
     agent.start(np.array([0.1]))
     agent.step(0.0, np.array([0.4]), False)

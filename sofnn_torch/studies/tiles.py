@@ -22,24 +22,24 @@ MOVED = (1, 3, 5, 7, 9, 11)  # parts of a tile by which the next grid is moved a
 
 @dataclass(frozen=True)
 class TileConfig:
-    """Settings of a tile coder that learns.
+    """Settings of a tile coder that learns; those that a search found for the maze (peers).
 
     Examples:
-        >>> TileConfig(tiles=(6, 6, 8)).tilings
-        2
+        >>> TileConfig(tiles=(4, 4, 6)).tilings
+        8
     """
 
-    tilings: int = 2
+    tilings: int = 8
     """Number of grids m."""
     tiles: tuple[int, ...] = (6, 6, 8)
     """Tiles of a grid along each axis."""
-    rate: float = 0.5
+    rate: float = 0.8
     """Step size alpha."""
-    trace_decay: float = 0.9
+    trace_decay: float = 0.95
     """Lambda of the replacing eligibility traces."""
     initial: float = 0.65
     """Value of an unknown state; optimistic at the start of the maze."""
-    epsilon: float = 0.0
+    epsilon: float = 0.01
     """Share of decisions that are drawn by chance."""
     watkins: bool = False
     """Learn the values of the best next action, and clear the traces at another."""
