@@ -3,6 +3,7 @@
 import json
 import math
 
+import numpy as np
 import pytest
 
 from sofnn_torch.studies import peers
@@ -61,6 +62,27 @@ def test_every_learner_plays_and_the_page_has_a_row_for_each(tmp_path):
     assert all(peers.TITLES[name] in text for name in options.learners)
     assert "--learners tiles --seeds 0 --tries 1 --trials 1 --max-steps 50" in text
     assert peers.run(Options(learners=("q",), report_only=True, out=tmp_path)) == 0
+
+
+@pytest.mark.parametrize(
+    ("ours", "said"),
+    [
+        (12.0, "fewer, the goal reached"),
+        (50.0, "fewer"),
+        (110.0, "not clearly fewer or more"),
+        (200.0, "more"),
+    ],
+)
+def test_the_page_says_who_needs_fewer_steps(ours, said):
+    spread = 0.1 * np.arange(-2, 3)
+    rows = [
+        {"learner": name, "steps_to_learn": size * (1 + x)}
+        for name, size in (("sga", ours), ("q", ours), ("tiles", 100.0))
+        for x in spread
+    ]
+    (text,) = peers._compared(rows)
+    first = text.split("(ours): ")[1].partition(";")[0]
+    assert first.startswith(f"{ours / 100:.2f} (") and first.endswith(f"), {said}")
 
 
 @pytest.mark.parametrize("name", ["dqn", "ppo"])

@@ -37,7 +37,7 @@ from sofnn_torch.runs.session import arithmetic
 from sofnn_torch.runs.settings import Config
 from sofnn_torch.studies.collecting import IN_A_ROW, WITHIN, trials_to_learn
 from sofnn_torch.studies.results import NEVER, cell, markdown, read_table, write_table
-from sofnn_torch.studies.statistics import median
+from sofnn_torch.studies.statistics import FAILS, HOLDS, OPEN, judge, median, ratio
 from sofnn_torch.studies.tiles import TileCoder, TileConfig
 from sofnn_torch.terminal import say
 
@@ -52,6 +52,7 @@ OURS = ("sga", "q")
 COUNTS = ("seeds", "tries", "trials", "decisions", "max_steps")  # options of a measurement
 FIRST = 1000  # seed of the first try of a search
 PLAYED = 20  # greedy trials after learning
+GOAL = 0.25  # steps to learn over those of tile coding
 TILES: dict[str, tuple[Any, ...]] = {
     "tilings": (1, 2, 4, 8),
     "tiles": ((4, 4, 6), (6, 6, 8), (8, 8, 8), (10, 10, 12), (14, 14, 16)),
@@ -260,12 +261,33 @@ def page(rows: list[dict[str, Any]], info: dict[str, Any]) -> str:
         line.append(f"{100 * columns['greedy_success'].mean():.0f} %")
         table.append([*line, cell(median(columns["greedy_steps"]))])
     parts = ["# Other learners in the same maze", HOW, markdown(head, table)]
+    parts += _compared(rows) * ({"tiles", *OURS} <= info.keys())
     for learner, told in info.items():
         if learner not in OURS:
             parts += [f"## {TITLES[learner]}: the search", _searched(learner, told)]
     made = "; ".join(f"{TITLES[name]}: `{told['command']}`" for name, told in info.items())
     parts += ["## Provenance", f"{made}. A row for each run: [peers.csv](peers.csv)."]
     return "\n\n".join(parts) + "\n"
+
+
+def _compared(rows: list[dict[str, Any]]) -> list[str]:
+    """Ours over tile coding in steps of the environment, the real competitor."""
+
+    def took(learner: str) -> Any:
+        values = [float(row["steps_to_learn"]) for row in rows if row["learner"] == learner]
+        return np.nan_to_num(values, nan=NEVER)
+
+    found = {name: ratio(took(name), took("tiles")) for name in OURS}
+    said = {HOLDS: "fewer", FAILS: "more", OPEN: "not clearly fewer or more"}
+    texts = [
+        f"{TITLES[name]}: {cell(measured, 2)}, {said[judge(measured, 0.0, 1.0)]}"
+        f"{', the goal reached' * (judge(measured, 0.0, GOAL) == HOLDS)}"
+        for name, measured in found.items()
+    ]
+    return [
+        "Steps of the environment to learn over those of tile coding, ratios of medians (the goal "
+        f"is {GOAL}): {'; '.join(texts)}. Each verdict is single."
+    ]
 
 
 def _searched(learner: str, told: dict[str, Any]) -> str:
