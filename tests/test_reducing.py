@@ -158,7 +158,7 @@ def test_goals_count_before_steps_and_return_alone_where_there_is_no_goal():
     full = visited([1.0, 1.0, 0.0], [500, 500, 20_000])
     assert visited([1.0, 1.0], [900, 900]).worth > visited([1.0, 0.0], [400, 400]).worth
     assert visited([1.0, 1.0], [510, 520]).loss(full) == pytest.approx(0.03)
-    assert visited([1.0, 0.0], [400, 400]).loss(full) == pytest.approx(0.5)
+    assert visited([1.0, 0.0], [400, 400]).loss(full) == 1
     pole = visited([500.0, 500.0], [500, 500], goals=False)
     assert visited([495.0, 500.0], [495, 500], goals=False).loss(pole) == pytest.approx(0.005)
     car = visited([-100.0, -100.0], [100, 100], goals=False)
@@ -194,7 +194,6 @@ def hurried(monkeypatch):
         "MOST": 1,
         "STEPS": 5,
         "TRIALS": 2,
-        "FINAL": 1,
         "DECIDING": 1,
     }.items():
         monkeypatch.setattr(reducing, name, value)

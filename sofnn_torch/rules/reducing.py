@@ -5,7 +5,8 @@ exploration (`sofnn_torch.rules.fitting`). Then the small policy plays, the full
 would have done at the states that this leads to, these join the others, and the fit goes on (Ross,
 Gordon and Bagnell, A reduction of imitation learning and structured prediction to no-regret online
 learning, AISTATS 2011). There are more rounds where the small policy does not play as well yet.
-Those that played best play more trials, and the best one is taken.
+One that plays as well has to do so in many more trials, those that it fails teach too, and the best
+one is taken.
 """
 
 import math
@@ -30,11 +31,11 @@ from sofnn_torch.runs.factory import make_agent, make_env
 from sofnn_torch.runs.settings import Config
 from sofnn_torch.terminal import plural
 
-ROUNDS, MOST = 5, 12  # of fitting and playing; if none plays as well as the full policy
+ROUNDS, MOST = 3, 12  # of fitting and playing; if none plays as well as the full policy
 LOSS = 0.02  # share of steps, or of return, by which it may play worse
 STEPS = 300  # of the optimizer in a round; twice as many in the first
 TRIALS = 10  # that the full policy plays to begin with, and the small one in each round
-FINAL, DECIDING = 3, 20  # policies that play again, and how many trials
+DECIDING = 150  # trials in which a small policy that plays as well must go on to do so
 HOTTER = 1.0, 4.0  # exploration of the trials that show what lies beside the way
 LONGER = 2  # a trial is cut at so many times the longest of the full policy
 CLOSE = 0.1  # numbers of actions, of [-1, 1], that differ by no more agree
@@ -65,15 +66,28 @@ class Visit:
     @property
     def worth(self) -> tuple[float, float]:
         """The greater the better: more goals or return, then fewer steps."""
-        return sum(self.outcomes), -sum(self.steps)
+        return float(np.mean(self.outcomes)), -float(np.mean(self.steps))
+
+    @property
+    def lessons(self) -> list[NDArray[np.float32]]:
+        """The states of some trials, and of all that missed the goal."""
+        trials = zip(self.states, self.outcomes, strict=True)
+        missed = [states for states, goal in trials if self.goals and not goal]
+        return self.states[:TRIALS] + missed
+
+    def and_then(self, other: "Visit") -> "Visit":
+        """The trials of both."""
+        states, outcomes = self.states + other.states, self.outcomes + other.outcomes
+        return Visit(states, self.goals, outcomes, self.steps + other.steps)
 
     def loss(self, full: "Visit") -> float:
-        """By what share of trials without a goal, of steps or of return it is too bad."""
-        if not self.goals:
-            return (sum(full.outcomes) - sum(self.outcomes)) / max(abs(sum(full.outcomes)), 1e-9)
-        arrived = [n for n, goal in zip(full.steps, full.outcomes, strict=True) if goal]
-        longer = np.mean(self.steps) / np.mean(arrived or full.steps) - 1
-        return max(1 - float(np.mean(self.outcomes)), float(longer))
+        """By what share of steps or of return it is too bad; all, where a trial misses the goal."""
+        if self.goals:
+            arrived = [n for n, goal in zip(full.steps, full.outcomes, strict=True) if goal]
+            longer = float(np.mean(self.steps) / np.mean(arrived or full.steps)) - 1
+            return longer if all(self.outcomes) else 1.0
+        mean = float(np.mean(full.outcomes))
+        return (mean - float(np.mean(self.outcomes))) / max(abs(mean), 1e-9)
 
 
 def visit(
@@ -148,28 +162,29 @@ def reduced(
             seen += visit(env, agent, TRIALS // 2, hotter, most).states
         if (different := len(np.unique(np.concatenate(seen), axis=0))) < count:
             raise ValueError(f"--reduce {count}: the policy visits only {different} states")
-        fit, best = Fit(agent, np.concatenate(seen), count, seed), math.inf
-        played: list[tuple[tuple[float, float], int, Learner]] = []
+        fit = Fit(agent, np.concatenate(seen), count, seed)
+        played: list[tuple[int, tuple[float, float], int, Learner]] = []
         with Progress(plural(count, "rule"), ROUNDS, quiet=quiet) as progress:
             for turn in range(MOST):
                 fit.improve(np.concatenate(seen), STEPS if turn else 2 * STEPS)
                 small = make_agent(config)
                 small.net.replace_rules(*fit.found())
                 visited = visit(env, small, TRIALS, most=most)
-                seen += visited.states
-                played.append((visited.worth, turn, small))
-                best = min(best, visited.loss(plain))
+                while (
+                    turn + 1 >= ROUNDS
+                    and (good := visited.loss(plain) <= LOSS)
+                    and len(visited.steps) < DECIDING
+                ):
+                    visited = visited.and_then(visit(env, small, TRIALS, most=most))
+                seen += visited.lessons
+                played.append((len(visited.steps), visited.worth, turn, small))
                 progress.update(facts=[f"{np.mean(visited.steps):,.0f} steps"])
-                if turn + 1 >= ROUNDS and best <= LOSS:
+                if turn + 1 >= ROUNDS and good:
                     break
                 progress.total = ROUNDS if turn + 1 < ROUNDS else MOST
-        last = [
-            (visit(env, small, DECIDING, most=most).worth, turn, small)
-            for _, turn, small in sorted(played)[-FINAL:]
-        ]
     finally:
         env.close()
-    return max(last)[2]
+    return max(played)[-1]
 
 
 @dataclass(frozen=True)
