@@ -7,10 +7,13 @@
 Runs that differ in nothing but their seed and their number of trials are one group: a line for the
 median over its seeds, a band from the first to the third quartile, and each seed faintly; of fewer
 than five seeds each is a line. The table is of the last 10 trials of each run. Runs that are still
-learning can be drawn.
+learning can be drawn; those without a trial yet are left out. A run made of another one's rules
+(rules --load, --reduce) begins with the trials of that one: it is no further seed, and has a group
+of its own.
 """
 
 import dataclasses
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,7 +31,7 @@ from sofnn_torch.runs import checkpoint
 from sofnn_torch.runs.directory import flatten, load_config
 from sofnn_torch.runs.settings import MAZE
 from sofnn_torch.runs.table import line
-from sofnn_torch.terminal import check_output, command, plural
+from sofnn_torch.terminal import check_output, command, plural, say
 
 LAST = 10  # trials at the end of each run that the table tells of
 ENDINGS = (".png", ".svg", ".pdf")
@@ -82,7 +85,7 @@ def group(runs: Sequence[Path]) -> dict[str, list[Path]]:
         config = load_config(run)
         flat = flatten(dataclasses.asdict(config))
         flat = {name: str(value) for name, value in flat.items() if name not in ("seed", "trials")}
-        settings[run] = flat | {"agent": config.learner.name}
+        settings[run] = flat | {"agent": config.learner.name, "made": _made(run)}
     names = sorted(set().union(*settings.values()), key=lambda name: (name not in FIRST, name))
     varying = [n for n in names if len({flat.get(n) for flat in settings.values()}) > 1]
     distinct = len({tuple(sorted(flat.items())) for flat in settings.values()})
@@ -94,6 +97,32 @@ def group(runs: Sequence[Path]) -> dict[str, list[Path]]:
     for run, label in labels.items():
         groups.setdefault(label, []).append(run)
     return groups
+
+
+def _made(run: Path) -> str:
+    """How a run was made: trained, or of the rules of another one, edited or reduced."""
+    sessions = json.loads((run / "config.json").read_bytes()).get("earlier", [])
+    changes = [what for what in ("edited", "reduced") if any(what in s for s in sessions)]
+    return " and ".join(changes) or "trained"
+
+
+def _with_trials(runs: Sequence[Path]) -> list[Path]:
+    """The runs that have played a trial; a line says which others are left out.
+
+    Raises:
+        ValueError: none has, or a directory is no run.
+    """
+    begun = []
+    for run in runs:
+        load_config(run)
+        file = run / "trials.csv"
+        if file.exists() and file.read_bytes().count(b"\n") > 1:
+            begun.append(run)
+        else:
+            say(f"{run}: no trial yet, left out")
+    if not begun:
+        raise ValueError("no run has a trial yet")
+    return begun
 
 
 def _label(settings: Mapping[str, str], names: Sequence[str]) -> str:
@@ -145,7 +174,7 @@ def run(options: Options) -> None:
     """
     check_output("--out", options.out, ENDINGS)
     check_output("--csv", options.csv, (".csv",))
-    groups = group(find(options.runs))
+    groups = group(_with_trials(find(options.runs)))
     first = next(iter(groups.values()))[0]
     quantity = options.quantity or ("steps" if load_config(first).env == MAZE else "reward")
     raw = {

@@ -99,7 +99,11 @@ class Progress:
         return (self.total - self.done) * (self.recent + between)
 
     def line(self, width: int) -> str:
-        """The line for a terminal of so many columns: time left and first fact stay longest."""
+        """The line for a terminal of so many columns.
+
+        Bar and name, which the user has just given, go before a fact does; time left and first
+        fact stay longest.
+        """
         name, facts = f"{self.name} ", list(self.facts)
         percent = f"{100 * self.done // max(self.total, 1):3d}%"
         for kept in range(len(facts), 0, -1):
@@ -108,6 +112,8 @@ class Progress:
             if room >= NARROW:
                 filled = room * self.done // max(self.total, 1)
                 return f"{name}{percent}|{'#' * filled:-<{room}}| {text}"
+            if len(line := f"{percent} {text}") <= width:
+                return line
         text = self._numbers(facts[:1])
         return next(
             (line for line in (f"{name}{percent} {text}", text) if len(line) <= width), text[:width]

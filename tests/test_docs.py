@@ -111,6 +111,7 @@ def place(tmp_path_factory):
         (folder / file).write_text(text)
     drawn = re.search(r"\n\n((?: {4}.*\n)+)", (ROOT / "docs" / "mazes.md").read_text())[1]
     (folder / "my_maze.txt").write_text(re.sub(r"(?m)^ {4}", "", drawn))
+    shutil.copy(ROOT / "examples" / "own_task.py", folder / "my_task.py")
     (folder / "my_package.py").write_text(
         "import gymnasium\n"
         "from gymnasium.envs.classic_control import CartPoleEnv\n"

@@ -12,6 +12,8 @@ import gymnasium
 import pytest
 
 import sofnn_torch
+from sofnn_torch import Config, RunOptions, load, train
+from sofnn_torch.pictures.film import film
 
 ROOT = Path(__file__).parents[1]
 MODULES = [
@@ -95,3 +97,25 @@ def test_an_agent_of_stable_baselines3_learns_in_the_maze(capsys):
     assert re.match(
         r"mean return -?\d+ untrained, -?\d+ after 500 decisions\n", capsys.readouterr().out
     )
+
+
+def test_a_task_of_ones_own_is_trained_by_its_name_and_filmed(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(ROOT / "examples")
+    config = Config(env="own_task:Parking-v0", agent="q", trials=2)
+    run = train(config, RunOptions(runs=tmp_path, video_every=0, picture_every=0, quiet=True))
+    config, agent, _, _ = load(run)
+    assert [axis.high for axis in config.task.axes] == [1, 1]
+    frames = list(film(config, agent, limit=3))
+    assert len(frames) == 4 and frames[0].shape == (32, 256, 3)
+    assert (frames[0] == 0).all(axis=-1).sum() == 24 * 16  # the cart, in black
+
+
+@pytest.mark.filterwarnings("ignore:.*already in registry")
+def test_a_cart_parks_where_it_comes_to_rest_at_the_mark():
+    cart = example("own_task")["Parking"]()
+    cart.reset(seed=0)
+    cart.place, cart.speed = 0.70, 0.1  # rolls 10 mm a step: at 0.76 it is near enough
+    ends = [cart.step(1)[2] for _ in range(6)]
+    assert ends == [False] * 5 + [True]
+    cart.place, cart.speed = 0.76, 0.4  # through the mark without a stop
+    assert not cart.step(1)[2]

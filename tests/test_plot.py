@@ -54,6 +54,29 @@ def test_a_run_that_is_given_twice_is_drawn_once(runs, monkeypatch):
     assert [run.name for run in found] == ["a0", "a1", "a2", "b"]
 
 
+@pytest.mark.parametrize("change", ["edited", "reduced"])
+def test_a_copy_with_other_rules_is_no_further_seed(change, tmp_path):
+    write_run(tmp_path / "r", [9, 8])
+    copy = write_run(tmp_path / "copy", [9, 8])
+    saved = json.loads((copy / "config.json").read_text())
+    (copy / "config.json").write_text(json.dumps(saved | {"earlier": [{change: {}}]}))
+    names = {k: [r.name for r in v] for k, v in plot.group(plot.find([tmp_path])).items()}
+    assert names == {"made trained": ["r"], f"made {change}": ["copy"]}
+
+
+def test_runs_without_a_trial_are_left_out_and_said(runs, capsys):
+    (write_run(runs / "new", []) / "trials.csv").unlink()  # as rules --new makes it
+    write_run(runs / "young", [])
+    plot.run(plot.Options(runs=(runs,), out=runs / "x.png"))
+    out, err = capsys.readouterr()
+    assert "(4 runs)" in out
+    assert (
+        err == f"{runs / 'new'}: no trial yet, left out\n{runs / 'young'}: no trial yet, left out\n"
+    )
+    with pytest.raises(ValueError, match="no run has a trial yet"):
+        plot.run(plot.Options(runs=(runs / "young",), out=runs / "y.png"))
+
+
 @pytest.mark.parametrize("window", [1, 3, 100])
 def test_each_point_is_the_mean_of_the_trials_until_there(window):
     values = np.random.default_rng(0).normal(size=30)
