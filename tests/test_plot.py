@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from sofnn_torch import Config, plot
+from sofnn_torch.runs import directory
 from sofnn_torch.runs.settings import NetworkConfig
 
 
@@ -124,3 +125,19 @@ def test_what_cannot_be_drawn_is_one_line(options, message, tmp_path, monkeypatc
     options["runs"] = tuple(map(plot.Path, options["runs"]))
     with pytest.raises(ValueError, match=message):
         plot.run(plot.Options(**options))
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("runs", r"runs: not a run directory \(it holds runs: take one, such as runs/first\)"),
+        ("runs/frist", r"runs/frist: not a run directory \(did you mean runs/first\?\)"),
+        ("first", r"first: not a run directory \(did you mean runs/first\?\)"),
+        ("nowhere", r"nowhere: not a run directory \(config.json: No such file or directory\)"),
+    ],
+)
+def test_who_names_no_run_hears_which_may_be_meant(name, message, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write_run(tmp_path / "runs" / "first", [9])
+    with pytest.raises(ValueError, match=f"^{message}$"):
+        directory.load_config(plot.Path(name))

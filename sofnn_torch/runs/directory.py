@@ -23,7 +23,7 @@ import filelock
 from sofnn_torch.progress import say
 from sofnn_torch.runs import checkpoint, table
 from sofnn_torch.runs.checkpoint import CheckpointError
-from sofnn_torch.runs.places import UNNAMED, alone, first_free
+from sofnn_torch.runs.places import UNNAMED, alone, first_free, meant
 from sofnn_torch.runs.provenance import record
 from sofnn_torch.runs.settings import Config, from_dict
 from sofnn_torch.terminal import quoted
@@ -311,7 +311,8 @@ def load_config(path: Path) -> Config:
         data = json.loads(checkpoint.read_file(file, LARGEST_SETTINGS))
         return from_dict(data["config"])
     except OSError as error:
-        raise ValueError(f"{path}: not a run directory (config.json: {error.strerror})") from None
+        hint = meant(Path(path)) or f"config.json: {error.strerror}"
+        raise ValueError(f"{path}: not a run directory ({hint})") from None
     except (json.JSONDecodeError, UnicodeDecodeError, RecursionError, KeyError, TypeError):
         raise ValueError(f"{file}: not the settings of a run") from None
     except ValueError as error:

@@ -1,6 +1,7 @@
 """Where runs go: their names, and how several that start at once get along."""
 
 import contextlib
+import difflib
 import fcntl
 import itertools
 import os
@@ -59,3 +60,14 @@ def alone(parent: Path) -> Iterator[None]:
         yield
     finally:
         os.close(descriptor)
+
+
+def meant(path: Path) -> str:
+    """For one who named no run: which one may be meant; empty if there is none."""
+    inside = sorted(path.glob("[!.]*/config.json"), key=lambda file: file.stat().st_mtime)
+    if inside:
+        return f"it holds runs: take one, such as {inside[-1].parent}"
+    beside = [*path.parent.glob("[!.]*/config.json"), *Path("runs").glob("[!.]*/config.json")]
+    near = difflib.get_close_matches(path.name, [file.parent.name for file in beside], 1, 0.8)
+    found = next((file.parent for file in beside if file.parent.name in near), None)
+    return f"did you mean {found}?" if found else ""
