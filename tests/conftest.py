@@ -1,6 +1,7 @@
 """Shared fixtures: runs of a second or less, and what two runs must have in common."""
 
 import math
+import signal
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,6 +19,10 @@ from sofnn_torch.training import RunOptions
 
 torch.set_num_threads(1)
 SLOW = [HealthCheck.too_slow, HealthCheck.data_too_large]  # the machine may be busy
+
+
+# Under nohup it is ignored, by every process that a test starts too.
+signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 
 def settings(agent="sga", network="sofnn", pose="estimated", seed=0, trials=4, **parts) -> Config:
