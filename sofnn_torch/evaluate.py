@@ -181,8 +181,12 @@ def played(
     seeding.begin(env, agent, seed)
     records: list[TrialRecord] = []
     with Progress("evaluation", episodes, quiet=quiet) as progress:
+
+        def seen(steps: int) -> None:
+            progress.within(f"trial {len(records) + 1}: {steps:,} steps")
+
         for trial in range(1, episodes + 1):
-            record, _ = play(env, agent, learn=False, explore=explore, plain=plain)
+            record, _ = play(env, agent, False, explore, plain=plain, seen=seen)
             records.append(dataclasses.replace(record, trial=trial))
             mean = sum(r.outcome for r in records) / trial
             said = f"return {mean:,.4g}" if record.success is None else f"goal in {mean:.0%}"
@@ -286,17 +290,38 @@ def loops(records: Sequence[TrialRecord]) -> str:
 
 
 def write_video(
-    path: Path, config: Config, agent: Learner, seed: int, explore: bool, plain: bool = False
+    path: Path,
+    config: Config,
+    agent: Learner,
+    seed: int,
+    explore: bool,
+    plain: bool = False,
+    steps: int = 0,
 ) -> None:
     """Film the first trial that `evaluate` plays with the same seed, 30 times as fast as it is.
+
+    Args:
+        path: of the film, .gif or .mp4.
+        config: settings of the run.
+        agent: the learner; only its random generator moves, and is set back.
+        seed: as for `evaluate`.
+        explore: sample the stochastic policy.
+        plain: without the cure for loops.
+        steps: of that trial, for the progress; 0 shows none.
 
     Raises:
         OSError: the film cannot be made or written.
     """
-    small = {"steps_per_frame": 5, "size": 360} if config.env == MAZE else {}
-    gifs = path.suffix.lower() == ".gif"
-    frames = film(config, agent, seed=seed, explore=explore, plain=plain, **(small if gifs else {}))
-    checkpoint.write_atomically(path, gif(frames) if gifs else mp4(frames))
+    gifs, each = path.suffix.lower() == ".gif", 1
+    size: dict[str, int] = {}
+    if config.env == MAZE:
+        each, pixels = (5, 360) if gifs else (2, 480)
+        size = {"steps_per_frame": each, "size": pixels}
+    total = 1 + math.ceil(steps / each)
+    with Progress("film", total, quiet=not steps) as progress:
+        frames = film(config, agent, seed=seed, explore=explore, plain=plain, **size)
+        shown = progress.through(frames)
+        checkpoint.write_atomically(path, gif(shown) if gifs else mp4(shown))
 
 
 def optimum(config: Config) -> float | None:
@@ -350,7 +375,8 @@ def run(options: Options) -> dict[str, Estimate]:
         checkpoint.write_atomically(options.json, data.encode())
         print(f"written: {options.json}")
     if options.video:
-        write_video(options.video, config, agent, options.seed, options.explore, options.plain)
+        how = options.seed, options.explore, options.plain
+        write_video(options.video, config, agent, *how, records[0].steps)
         print(f"written: {options.video}")
     return rows
 

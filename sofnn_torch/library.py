@@ -123,11 +123,15 @@ class Agent:
         successes: deque[bool] = deque(maxlen=WINDOW)
         records: list[TrialRecord] = []
         progress = Progress("learning", trials, quiet=quiet)
+
+        def seen(steps: int) -> None:
+            progress.within(f"trial {self.trials + 1}: {steps:,} steps")
+
         try:
             with arithmetic():
                 for _ in range(trials):
                     begin = time.perf_counter()
-                    record, _ = play(task, self.learner)
+                    record, _ = play(task, self.learner, seen=seen)
                     seconds = time.perf_counter() - begin
                     record = self._advance(record, task.state_dict())
                     records.append(record)

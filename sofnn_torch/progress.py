@@ -4,13 +4,17 @@ import contextlib
 import os
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import TypeVar
 
 from sofnn_torch.numerals import whole
+
+T = TypeVar("T")
 
 EVERY = 0.1  # seconds from one redraw of a bar to the next
 LINES = 10  # of progress in a file at most,
 APART = 5.0  # and seconds from one to the next at least
+LONG = 1.0  # seconds after which a unit shows where it is
 SMOOTHING = 0.1  # weight of the last unit in the time that one takes
 NARROW = 10  # cells of the shortest bar
 USUAL = 80  # columns where the terminal does not say
@@ -43,6 +47,7 @@ class Progress:
     ):
         self.name, self.total, self.done, self.quiet, self.clock = name, total, done, quiet, clock
         self.facts: Sequence[str] = ()
+        self.inside = ""
         self.begin = self.last = clock()
         self.drawn, self.noted = self.begin - EVERY, self.begin
         self.units, self.own, self.recent = 0, 0.0, 0.0
@@ -73,6 +78,7 @@ class Progress:
         if facts is not None:
             self.facts = facts
         if units:
+            self.inside = ""
             now, tenth = self.clock(), LINES * self.done // max(self.total, 1)
             each = (now - self.last if seconds is None else seconds) / units
             weight = SMOOTHING if self.units else 1.0
@@ -82,6 +88,18 @@ class Progress:
             if LINES * self.done // max(self.total, 1) > tenth:
                 self._note(now)
         self._show()
+
+    def within(self, fact: str) -> None:
+        """Note how far a long unit of work is, shown before the other facts until it is done."""
+        if self.clock() - self.last > LONG:
+            self.inside = fact
+            self._show()
+
+    def through(self, things: Iterable[T]) -> Iterator[T]:
+        """The things, each a unit of work that is done when it comes."""
+        for thing in things:
+            self.update()
+            yield thing
 
     def print(self, text: str) -> None:
         """Print a line of the results above."""
@@ -104,7 +122,7 @@ class Progress:
         Bar and name, which the user has just given, go before a fact does; time left and first
         fact stay longest.
         """
-        name, facts = f"{self.name} ", list(self.facts)
+        name, facts = f"{self.name} ", [*filter(None, [self.inside]), *self.facts]
         percent = f"{100 * self.done // max(self.total, 1):3d}%"
         for kept in range(len(facts), 0, -1):
             text = self._numbers(facts[:kept])

@@ -38,6 +38,7 @@ def play(
     explore: bool = True,
     trap: SignalTrap | None = None,
     plain: bool = False,
+    seen: Callable[[int], None] | None = None,
 ) -> tuple[TrialRecord, Trajectory]:
     """One trial from the start to the goal or the trial's limit.
 
@@ -48,6 +49,7 @@ def play(
         explore: choose actions as in training (always so if learn).
         trap: where signals are noted.
         plain: a frozen policy does without its cure for loops.
+        seen: called with the steps so far after each decision.
 
     Returns:
         The record of the trial (its number is 0) and the poses from the start on.
@@ -71,6 +73,8 @@ def play(
             action = policy.step(reward, observation, terminated, truncated)
             recorder.add(reward, observation, info)
             watch.check(reward)
+            if seen:
+                seen(info["total_steps"])
     if frozen:
         return recorder.finish(agent, {}, frozen.freed)
     return recorder.finish(agent, agent.statistics())
@@ -150,10 +154,14 @@ def _loop(
         run.path, run.config, session.trial + 1, options.picture_every, options.video_every
     )
     progress = Progress(run.path.name, run.config.trials, session.trial, options.quiet)
+
+    def seen(steps: int) -> None:
+        progress.within(f"trial {session.trial + 1}: {steps:,} steps")
+
     try:
         while session.trial < run.config.trials:
             begin = time.perf_counter()
-            record, path = play(session.env, agent, trap=trap)
+            record, path = play(session.env, agent, trap=trap, seen=seen)
             seconds = time.perf_counter() - begin
             speed = record.steps / seconds
             record = dataclasses.replace(

@@ -136,6 +136,29 @@ def test_quiet_is_quiet(terminal, clock):
     assert not terminal.read()
 
 
+def test_a_long_unit_shows_where_it_is_until_it_is_done(terminal, clock):
+    terminal.resize(100)
+    with Progress("run", 10, clock=clock) as bar:
+        clock.now += 0.5
+        bar.within("trial 1: 700 steps")
+        short = bar.line(99)
+        clock.now += 3
+        bar.within("trial 1: 5,200 steps")
+        assert "0/10 [0:03<?, trial 1: 5,200 steps]" in terminal.read()
+        bar.update(facts=FACTS)
+        done = bar.line(99)
+    assert "trial" not in short and "trial" not in done and FACTS[0] in done
+
+
+@pytest.mark.parametrize("ending,frames", [("gif", 5), ("mp4", 11)])
+def test_a_film_shows_how_far_it_is(ending, frames, terminal, tmp_path, monkeypatch):
+    terminal.resize(100)
+    pictures = [np.zeros((16, 16, 3), np.uint8)] * frames
+    monkeypatch.setattr(evaluate, "film", lambda *_, **__: iter(pictures))
+    evaluate.write_video(tmp_path / f"film.{ending}", settings(), None, 0, False, steps=20)
+    assert f"{frames}/{frames} [" in terminal.read()
+
+
 def test_a_video_does_not_spoil_the_time_left(clock):
     """Trials of a second and 50 seconds of video after every 50th: 200 trials take 400 s."""
     bar = Progress("run", 200, clock=clock)
