@@ -186,7 +186,7 @@ def played(
             progress.within(f"trial {len(records) + 1}: {steps:,} steps")
 
         for trial in range(1, episodes + 1):
-            record, _ = play(env, agent, False, explore, plain=plain, seen=seen)
+            record, _ = play(env, agent, learn=False, explore=explore, plain=plain, seen=seen)
             records.append(dataclasses.replace(record, trial=trial))
             mean = sum(r.outcome for r in records) / trial
             said = f"return {mean:,.4g}" if record.success is None else f"goal in {mean:.0%}"

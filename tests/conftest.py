@@ -28,8 +28,9 @@ signal.signal(signal.SIGHUP, signal.SIG_DFL)
 def settings(agent="sga", network="sofnn", pose="estimated", seed=0, trials=4, **parts) -> Config:
     """Settings of a run that takes a second; parts as in net={"theta": 0.5}."""
     config = Config(agent=agent, network=network)
-    parts = {"maze": {}, "net": {}} | parts
+    parts = {"maze": {}, "net": {}, agent: {}} | parts
     parts["maze"] = {"max_steps": 120} | parts["maze"]
+    parts[agent] = {"replays": 10} | parts[agent]
     if network == "fixed":
         parts["net"] = {"grid": (4, 4, 4)} | parts["net"]
     changes = {name: replace(getattr(config, name), **part) for name, part in parts.items()}

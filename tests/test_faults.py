@@ -163,7 +163,8 @@ def test_a_disk_that_is_read_only_for_a_while_costs_nothing(
 def without_privilege(*words):
     """The command of a training that obeys the permissions of files, as root would not."""
     command = [sys.executable, str(ROOT / "train.py"), *words, "--quiet", "--picture-every", "0"]
-    command += ["--video-every", "0", "--maze.max-steps", "120", "--checkpoint-every", "1"]
+    command += ["--video-every", "0", "--checkpoint-every", "1"]
+    command += ["--maze.max-steps", "120", "--sga.replays", "10"]  # as conftest.settings
     if os.geteuid() == 0:
         if not shutil.which("setpriv"):
             pytest.skip("root cannot give up its privilege here")
