@@ -5,6 +5,7 @@ import math
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -17,6 +18,7 @@ import neighbours
 import reduce
 import tasks
 import training
+import zoo
 
 from sofnn_torch.maze.settings import POSE
 from sofnn_torch.network.sofnn import SOFNN
@@ -208,3 +210,26 @@ def test_the_page_of_tasks_has_the_table_of_what_was_measured():
     root = Path(__file__).parents[1]
     cells = json.loads((root / "docs" / "results" / "tasks.json").read_text())
     assert cells and tasks.table(cells) in (root / "docs" / "tasks.md").read_text()
+
+
+def test_the_table_of_tuned_agents_has_values_of_few_seeds_and_intervals_of_five():
+    def rows(count, value):
+        return [
+            {"seed": i, "ours": None if value else -200.0, "return": value - i, "seconds": 3.0 + i}
+            for i in range(count)
+        ]
+
+    few, many = zoo.table({"CartPole-v1 ppo": rows(2, 0.0), "Acrobot-v1 dqn": rows(5, 9.0)}).split(
+        "\n"
+    )[2:]
+    assert few == "| CartPole-v1 | PPO | 2 | -200.0, -200.0 (50,000) | 0.0, -1.0 (100,000) | 4 |"
+    assert many.startswith("| Acrobot-v1 | DQN | 5 |  | 7.0, ") and many.endswith("(100,000) | 5 |")
+
+
+@pytest.mark.parametrize("env,algorithm", zoo.ZOO)
+def test_tuned_agents_of_others_learn_and_play(env, algorithm, monkeypatch):
+    pytest.importorskip("stable_baselines3")
+    monkeypatch.setitem(zoo.STEPS, env, 20)
+    monkeypatch.setattr(zoo, "EPISODES", 1)
+    row = zoo.learned(algorithm, env, 3, steps=40)
+    assert row["seed"] == 3 and row["ours"] is not None and np.isfinite(row["return"])
