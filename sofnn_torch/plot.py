@@ -6,14 +6,15 @@
 
 Runs that differ in nothing but their seed and their number of trials are one group: a line for the
 median over its seeds, a band from the first to the third quartile, and each seed faintly; of fewer
-than five seeds each is a line. The table is of the last 10 trials of each run. Runs that are still
-learning can be drawn; those without a trial yet are left out. A run made of another one's rules
-(rules --load, --reduce) begins with the trials of that one: it is no further seed, and has a group
-of its own.
+than five seeds each is a line. Each task has a panel, and more than five groups have several with
+the same axes. The table is of the last 10 trials of each run. Runs that are still learning can be
+drawn; those without a trial yet are left out. A run made of another one's rules (rules --load,
+--reduce) begins with the trials of that one: it is no further seed, and has a group of its own.
 """
 
 import dataclasses
 import json
+import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +22,7 @@ from typing import Annotated, Any
 
 import numpy as np
 import tyro
+from matplotlib.axes import Axes
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
@@ -34,9 +36,13 @@ from sofnn_torch.runs.table import line
 from sofnn_torch.terminal import check_output, command, plural, say
 
 LAST = 10  # trials at the end of each run that the table tells of
+LONG = 60  # letters that no label can hold
 ENDINGS = (".png", ".svg", ".pdf")
-FIRST = ("env", "agent", "network", "pose")  # named first where they differ
+FIRST = ("agent", "network", "pose")  # named first where they differ
+USUAL = {MAZE: "steps"}  # what is drawn; the reward in other tasks
 LABELS = {"steps": "steps to the goal", "success": "share of trials that reach the goal"}
+
+Curves = dict[str, list[NDArray[Any]]]  # by group, those of its runs
 
 
 @dataclass(frozen=True)
@@ -52,7 +58,7 @@ class Options(Settings):
     out: Path = Path("learning-curves.png")
     """The picture: a .png, .svg or .pdf file."""
     csv: Path | None = None
-    """Write the curves to this .csv file: group, run, trial, value."""
+    """Write the curves to this .csv file: task, group, run, trial, value."""
 
 
 def find(places: Sequence[Path]) -> list[Path]:
@@ -84,19 +90,28 @@ def group(runs: Sequence[Path]) -> dict[str, list[Path]]:
     for run in runs:
         config = load_config(run)
         flat = flatten(dataclasses.asdict(config))
-        flat = {name: str(value) for name, value in flat.items() if name not in ("seed", "trials")}
+        flat = {name: _short(str(v)) for name, v in flat.items() if name not in ("seed", "trials")}
         settings[run] = flat | {"agent": config.learner.name, "made": _made(run)}
     names = sorted(set().union(*settings.values()), key=lambda name: (name not in FIRST, name))
     varying = [n for n in names if len({flat.get(n) for flat in settings.values()}) > 1]
-    distinct = len({tuple(sorted(flat.items())) for flat in settings.values()})
-    for count in range(bool(varying), len(varying) + 1):  # as few names as tell all apart
-        labels = {run: _label(flat, varying[:count]) for run, flat in settings.items()}
-        if len(set(labels.values())) == distinct:
-            break
+    telling: list[str] = []  # as few names as tell all apart
+    labels = _labels(settings, telling)
+    for name in varying:
+        more = _labels(settings, [*telling, name])
+        if not telling or len(set(more.values())) > len(set(labels.values())):
+            telling, labels = [*telling, name], more
     groups: dict[str, list[Path]] = {}
     for run, label in labels.items():
         groups.setdefault(label, []).append(run)
     return groups
+
+
+def tasks(runs: Sequence[Path]) -> dict[str, dict[str, list[Path]]]:
+    """The groups of each task."""
+    found: dict[str, list[Path]] = {}
+    for run in runs:
+        found.setdefault(load_config(run).env, []).append(run)
+    return {task: group(own) for task, own in found.items()}
 
 
 def _made(run: Path) -> str:
@@ -123,6 +138,15 @@ def _with_trials(runs: Sequence[Path]) -> list[Path]:
     if not begun:
         raise ValueError("no run has a trial yet")
     return begun
+
+
+def _labels(settings: Mapping[Path, Mapping[str, str]], names: Sequence[str]) -> dict[Path, str]:
+    return {run: _label(flat, names) for run, flat in settings.items()}
+
+
+def _short(value: str) -> str:
+    """A setting as a label has it: of a map or a list of rules something that tells it apart."""
+    return value if len(value) < LONG else f"own {zlib.crc32(value.encode()):08x}"
 
 
 def _label(settings: Mapping[str, str], names: Sequence[str]) -> str:
@@ -156,13 +180,17 @@ def summary(curves: Mapping[str, Sequence[NDArray[Any]]], quantity: str) -> Tabl
 
 
 def write_table(
-    path: Path, groups: Mapping[str, Sequence[Path]], curves: Mapping[str, Sequence[NDArray[Any]]]
+    path: Path,
+    groups: Mapping[str, Mapping[str, Sequence[Path]]],
+    curves: Mapping[str, Curves],
 ) -> None:
     """Write every point of every curve as CSV."""
-    lines = [line(["group", "run", "trial", "value"])]
-    for name, runs in groups.items():
-        for run, curve in zip(runs, curves[name], strict=True):
-            lines += [line([name, run.name, i, float(v)]) for i, v in enumerate(curve, 1)]
+    lines = [line(["task", "group", "run", "trial", "value"])]
+    for task, own in groups.items():
+        for name, runs in own.items():
+            for run, curve in zip(runs, curves[task][name], strict=True):
+                points = enumerate(curve, 1)
+                lines += [line([task, name, run.name, i, float(v)]) for i, v in points]
     checkpoint.write_atomically(path, "".join(lines).encode())
 
 
@@ -174,21 +202,35 @@ def run(options: Options) -> None:
     """
     check_output("--out", options.out, ENDINGS)
     check_output("--csv", options.csv, (".csv",))
-    groups = group(_with_trials(find(options.runs)))
-    first = next(iter(groups.values()))[0]
-    quantity = options.quantity or ("steps" if load_config(first).env == MAZE else "reward")
-    raw = {
-        name: [figures.read_column(path / "trials.csv", quantity) for path in runs]
-        for name, runs in groups.items()
-    }
-    curves = {
-        name: [smoothed(curve, options.smooth) for curve in runs] for name, runs in raw.items()
-    }
-    figure, (ax,) = figures.canvas(width=6, height=3.6)
-    figures.learning_curves(curves, ax, quantity, LABELS.get(quantity, quantity))
+    groups = tasks(_with_trials(find(options.runs)))
+    most = len(figures.SERIES)
+    panels = [
+        (task, list(own)[at : at + most])
+        for task, own in groups.items()
+        for at in range(0, len(own), most)
+    ]
+    figure, axes = figures.canvas(len(panels), width=6, height=3.6, columns=2)
+    curves: dict[str, Curves] = {task: {} for task in groups}
+    first: dict[str, Axes] = {}
+    for (task, names), ax in zip(panels, axes, strict=True):
+        quantity = options.quantity or USUAL.get(task, "reward")
+        for name in names:
+            files = [path / "trials.csv" for path in groups[task][name]]
+            curves[task][name] = [figures.read_column(file, quantity) for file in files]
+        shown = {name: [smoothed(c, options.smooth) for c in curves[task][name]] for name in names}
+        if task in first:
+            ax.sharex(first[task])
+            ax.sharey(first[task])
+        first.setdefault(task, ax)
+        figures.learning_curves(shown, ax, quantity, LABELS.get(quantity, quantity))
+    if len(groups) > 1:
+        for task, ax in first.items():
+            ax.set_title(task)
     checkpoint.write_atomically(options.out, figures.saved(figure, options.out.suffix.lower()[1:]))
-    Console().print(summary(raw, quantity))
-    print(f"written: {options.out} ({plural(sum(map(len, groups.values())), 'run')})")
+    for task in groups:
+        Console().print(summary(curves[task], options.quantity or USUAL.get(task, "reward")))
+    count = sum(len(runs) for own in groups.values() for runs in own.values())
+    print(f"written: {options.out} ({plural(count, 'run')})")
     if options.csv:
         write_table(options.csv, groups, curves)
         print(f"written: {options.csv}")

@@ -29,16 +29,24 @@ FAILURES = dict.fromkeys((ValueError, OSError, RuntimeError, ArithmeticError), 2
 PLAIN = {
     r"Missing value for argument '(.+)'\. Expected 1 values\.": r"\1 needs a value",
     r"Missing value for argument '(.+)'\. Expected (\d+) values\.": r"\1 needs \2 values",
+    r"Missing from .+?: (--\S+) (?:\[.+?\]\]|\S+) (.+) \(required\)": r"\1 is missing: \2",
     r"Missing from .+?: (\S+) (.+) \(required\)": r"\1 is missing: \2",
     r"invalid choice (.+) for argument '(.+)'\. .+\((.+)\)\.": r"\2 must be one of \3, got \1",
-    r"Error parsing (\S+): .+ \{None\}\|\{?(.+?)\}? could .+? from (\[.*?\])\..*": (
-        r"\1 must be \2 or None, got \3"
-    ),
     r"Error parsing (\S+): (must be .+)": r"\1 \2",
     r"Error parsing (\S+): Could not find valid parse .+?: (.+)": r"\1 cannot be \2",
     r"Error parsing (\S+): .+? \[(.+)\] into tuple .+\[(.+)\]": r"\1 must be \3, got \2",
-    r"Error parsing (\S+): Could not find valid parse .+?: (\[.*\])": r"\1 cannot be \2",
-    r"Error parsing \w+: (--.+)": r"\1",  # said by a check of the settings
+    r"Error parsing [\w.]+: (.+)": r"\1",  # said by a check of the settings
+}
+# Values that are none of their flag, whose kind stands in the help below.
+WRONG = re.compile(
+    r"Error parsing (--\S+): (?:Could not find valid parse .+?: |no type matching .+? from )"
+    r"\[(.*?)\](?:\. .*)?"
+)
+KINDS = {
+    "[INT [INT ...]]": "whole numbers",
+    "[FLOAT [FLOAT ...]]": "numbers",
+    "INT": "a whole number",
+    "FLOAT": "a number",
 }
 
 TYPES = ConstructorRegistry()
@@ -231,11 +239,23 @@ def _first_message(framed: str) -> str:
         lines = lines[1:]
     end = next((i for i, line in enumerate(lines) if not line.strip("-─")), len(lines))
     what = " ".join(lines[:end])
+    if found := WRONG.fullmatch(what):
+        flag, given = found[1], " ".join(re.findall(r"""['"](.*?)['"](?:, |$)""", found[2]))
+        return f"{flag} must be {_kind(flag, lines[end:])}, got '{given}'"
     for said, plain in PLAIN.items():
         if found := re.fullmatch(said, what):
             return found.expand(plain)
     hint = next((m[1] for line in lines[end:] if (m := re.match(r"(--\w[\w.-]*)", line))), None)
     return f"{what}; did you mean {hint}?" if hint and "nrecognized" in what else what
+
+
+def _kind(flag: str, lines: Sequence[str]) -> str:
+    """What a flag takes, from tyro's help on it."""
+    shown = next(line for line in lines if line.startswith(f"{flag} ")).removeprefix(f"{flag} ")
+    kind = shown.removeprefix("{None}|")
+    if kind.startswith("{") and kind.endswith("}"):
+        kind = kind[1:-1]
+    return KINDS.get(kind, kind) + " or None" * (kind != shown)
 
 
 def plural(number: int, thing: str) -> str:

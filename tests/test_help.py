@@ -5,7 +5,7 @@ import re
 
 import pytest
 
-from sofnn_torch import cli, evaluate, help, plot
+from sofnn_torch import cli, evaluate, help, plot, terminal
 from sofnn_torch.export.__main__ import Options as Export
 from sofnn_torch.maze.optimum import Options as Optimum
 from sofnn_torch.rules.__main__ import Options as Rules
@@ -38,6 +38,18 @@ def test_types_are_said_in_words(kind, monkeypatch):
     shown = "\n".join(lines(kind, monkeypatch, 100))
     assert not re.search(r"\{|\}|None\||\|None|VALUE|<class|typing|MISSING", shown)
     assert not re.search(r"\[(?!OPTIONS)", shown)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_wrong_value_of_any_kind_is_answered_in_words(kind):
+    default = TRAIN if kind is cli.Flags else None
+    names = {flag.usage.partition(" ")[2]: flag.name for flag in help._flags(kind, default)}
+    for name in names.values():
+        try:
+            terminal.parse(kind, ["RUN", f"--{name}", "0.1,", "x"], "", default)
+        except ValueError as error:
+            said = str(error)
+            assert not re.search(r"FLOAT|\bINT\b|\[|\{|Error parsing|NoneType|class", said), said
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -3,11 +3,14 @@
 import csv
 import dataclasses
 import json
+import re
 
 import numpy as np
 import pytest
 
 from sofnn_torch import Config, plot
+from sofnn_torch.maze.settings import MazeConfig
+from sofnn_torch.pictures import figures
 from sofnn_torch.runs import directory
 from sofnn_torch.runs.settings import NetworkConfig
 
@@ -43,6 +46,44 @@ def test_groups_are_named_by_as_few_settings_as_tell_them_apart(tmp_path):
         write_run(tmp_path / f"f{theta}", [9], net=net, network="fixed")
     names = set(plot.group(plot.find([tmp_path])))
     assert names == {f"{n}, net.theta {t}" for n in ("sofnn", "fixed") for t in (0.3, 0.4)}
+
+
+def test_what_follows_from_another_setting_is_in_no_name(tmp_path):
+    for agent in ("sga", "q"):  # whose presets have other rewards
+        for theta in (0.3, 0.4):
+            net = NetworkConfig(theta=theta)
+            write_run(tmp_path / f"{agent}{theta}", [9], agent=agent, net=net)
+    names = set(plot.group(plot.find([tmp_path])))
+    assert names == {f"{agent}, net.theta {t}" for agent in ("sga", "q") for t in (0.3, 0.4)}
+
+
+def test_a_map_of_ones_own_has_a_short_name(tmp_path):
+    for name, row in (("a", "......"), ("b", ".....#")):
+        maze = MazeConfig(layout="\n".join(["cell 0.1", ">....G", *10 * [row]]))
+        write_run(tmp_path / name, [9], maze=maze)
+    names = list(plot.group(plot.find([tmp_path])))
+    assert len(set(names)) == 2 and all(re.fullmatch(r"maze.layout own \w{8}", n) for n in names)
+
+
+def test_more_groups_than_can_be_told_apart_and_other_tasks_have_panels_of_their_own(
+    tmp_path, capsys, monkeypatch
+):
+    for i in range(7):
+        write_run(tmp_path / f"r{i}", [100 + i] * (10 + i), net=NetworkConfig(theta=0.1 * (i + 1)))
+    write_run(tmp_path / "car", [120] * 9, env="MountainCar-v0")
+    drawn = []
+    monkeypatch.setattr(figures, "saved", lambda figure, kind: drawn.append(figure) or b"")
+    monkeypatch.setattr(figures, "read_column", lambda file, _: np.full(9, 120.0))
+    plot.run(plot.Options(runs=(tmp_path,), out=tmp_path / "x.png", csv=tmp_path / "x.csv"))
+    car, first, second = drawn[0].axes
+    assert [len(ax.get_legend().get_texts()) for ax in drawn[0].axes] == [1, 5, 2]
+    assert first.get_ylim() == second.get_ylim() and first.get_xlim() == second.get_xlim()
+    assert [ax.get_title() for ax in drawn[0].axes] == ["MountainCar-v0", "maze", ""]
+    assert first.get_ylabel() == "steps to the goal" and car.get_ylabel() == "reward"
+    said = capsys.readouterr().out
+    assert said.count("mean of the last 10 trials") == 2 and "(8 runs)" in said
+    groups = {row["group"] for row in csv.DictReader((tmp_path / "x.csv").open())}
+    assert groups == {"sga, sofnn"} | {f"net.theta {0.1 * (i + 1)}" for i in range(7)}
 
 
 def test_a_single_group_is_named_by_its_learner(tmp_path):
@@ -97,7 +138,7 @@ def test_the_picture_the_table_and_the_curves_are_written(runs, capsys):
     assert out.read_bytes()[:200].count(b"<?xml") == 1
     rows = list(csv.DictReader(curves.open()))
     assert len(rows) == 3 * 20 + 12
-    assert rows[-1] == {"group": "q", "run": "b", "trial": "12", "value": "50.0"}
+    assert rows[-1] == {"task": "maze", "group": "q", "run": "b", "trial": "12", "value": "50.0"}
 
 
 def test_another_quantity_is_a_column_of_the_trials(runs):

@@ -71,15 +71,22 @@ styled = matplotlib.rc_context(STYLE)  # as a decorator: in force while a functi
 
 @styled
 def canvas(
-    columns: int = 1, width: float = 3.5, height: float = 3.5, tight: bool = True
+    count: int = 1,
+    width: float = 3.5,
+    height: float = 3.5,
+    tight: bool = True,
+    columns: int | None = None,
 ) -> tuple[Figure, list[Axes]]:
-    """A figure with axes side by side; width and height of one of them in inches.
+    """A figure with so many axes; width and height of one of them in inches.
 
-    Without `tight` it has fixed margins, which is twice as fast.
+    They stand side by side, or in rows of so many columns. Without `tight` it has fixed margins,
+    which is twice as fast.
     """
-    figure = Figure(figsize=(columns * width, height))
+    columns = min(columns or count, count)
+    rows = math.ceil(count / columns)
+    figure = Figure(figsize=(columns * width, rows * height))
     figure.set_layout_engine("compressed" if tight else "none")
-    return figure, [figure.add_subplot(1, columns, i + 1) for i in range(columns)]
+    return figure, [figure.add_subplot(rows, columns, i + 1) for i in range(count)]
 
 
 def png(figure: Figure, dpi: int = 120) -> bytes:
