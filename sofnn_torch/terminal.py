@@ -178,13 +178,16 @@ def program(name: str | None = None) -> str:
     """What was called, as one can call it again: a module, a file or an installed command.
 
     Args:
-        name: of another command of this package, such as ``evaluate``; None for the same.
+        name: of another command of this package, such as ``evaluate`` or ``train``; None for the
+            same.
     """
     python = shlex.quote(sys.orig_argv[0] if sys.orig_argv else "python")
     module, path = sys.modules["__main__"].__spec__, sys.argv[0]
     installed = Path(path).name
     if name and module is None and installed.startswith("sofnn-"):
         return f"sofnn-{name}"
+    if name == "train":
+        return f"{python} {'train.py' if Path('train.py').is_file() else '-m sofnn_torch.cli'}"
     if name:
         return f"{python} -m sofnn_torch.{name}"
     if module:

@@ -13,6 +13,7 @@ from sofnn_torch import SOFNN, cli, evaluate, training
 from sofnn_torch.runs import checkpoint, rule_files, session
 from sofnn_torch.runs.directory import load_config
 from sofnn_torch.runs.factory import make_agent
+from sofnn_torch.runs.places import default_name
 from sofnn_torch.runs.settings import Config, from_dict
 
 RULES = Path(__file__).parents[1] / "examples" / "rules"
@@ -28,6 +29,11 @@ def test_ten_rules_by_hand_drive_to_the_goal_in_every_trial(agent):
     config = Config(agent=agent, rules=RULES / f"{agent}.csv")
     records = evaluate.evaluate(config, make_agent(config), 4)
     assert all(record.success and record.steps < 620 for record in records)
+
+
+def test_a_run_that_begins_with_rules_says_so_in_its_name():
+    assert default_name(short("q", seed=3)) == "q-sofnn-rules-estimated-s3"
+    assert default_name(Config(agent="q", seed=3)) == "q-sofnn-estimated-s3"
 
 
 @pytest.mark.slow

@@ -198,6 +198,15 @@ def test_a_program_is_named_as_it_was_called(argv, module, expected, monkeypatch
     assert terminal.program("evaluate") == others
 
 
+def test_a_training_is_named_by_what_there_is_to_call(tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "orig_argv", ["python3", "x"])
+    monkeypatch.setattr(sys, "argv", ["x"])
+    monkeypatch.chdir(tmp_path)
+    assert terminal.program("train") == "python3 -m sofnn_torch.cli"
+    (tmp_path / "train.py").touch()
+    assert terminal.program("train") == "python3 train.py"
+
+
 @pytest.mark.parametrize("runs,name", [("my runs", "one run"), ("-odd", "it's")])
 def test_the_hint_after_a_stop_can_be_pasted(runs, name, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)

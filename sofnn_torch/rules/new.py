@@ -38,7 +38,7 @@ def begin(argv: Sequence[str]) -> int:
         "next:",
         f"  {program('evaluate')} {run}",
         f"  {program('rules')} {run}",
-        f"  {program('cli')} --resume {run}    (learns on from them)",
+        f"  {program('train')} --resume {run}    (learns on from them)",
     ]
     print("\n".join(lines))
     return 0

@@ -17,13 +17,17 @@ UNNAMED = ".new-run"  # ending of a directory that is not yet whole
 
 
 def default_name(config: Config) -> str:
-    """Name of a run directory, e.g. sga-sofnn-estimated-s0, or sga-sofnn-rooms-estimated-s0."""
+    """Name of a run directory, e.g. sga-sofnn-estimated-s0, or sga-sofnn-rooms-estimated-s0.
+
+    A run that begins with rules says so, e.g. sga-sofnn-rules-estimated-s0.
+    """
     task = re.sub(r"[^\w.-]+", "-", config.env)
     if config.env == MAZE:
         layout = config.maze.layout
         name = "own" if "\n" in layout else layout.replace(":", "-")
         task = config.pose if layout == STANDARD else f"{name}-{config.pose}"
-    return f"{config.learner.name}-{config.network}-{task}-s{config.seed}"
+    begun = "-rules" if config.rules else ""
+    return f"{config.learner.name}-{config.network}{begun}-{task}-s{config.seed}"
 
 
 def numbered(path: Path) -> Iterator[Path]:
