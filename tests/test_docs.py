@@ -26,7 +26,9 @@ PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").g
 ALL_PAGES = [*PAGES, *ROOT.glob("C*.md"), *(ROOT / "docs").glob("*/*.md")]
 FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 INDENTED = re.compile(r"(?<=\n\n)((?: {4}.*\n|\n(?= {4}))+)")
-COMMAND = re.compile(r"(python|pip|echo|cp|tensorboard|for|done|[A-Z_]+=|\.ci/run| +python|sofnn-)")
+COMMAND = re.compile(
+    r"(python|pip|echo|cp|tensorboard|for|done|[A-Z_]+=|\.ci/run| +python|sofnn-(?!torch ))"
+)
 
 # What is not run, and why.
 LEFT = {
@@ -38,14 +40,17 @@ LEFT = {
     r"--viewer": "needs a display; tests/test_viewer.py",
     r"^python benchmarks/": "takes minutes and other packages; tests/test_benchmarks.py",
 }
+FEW_STEPS = "--maze.max-steps 2000"
 # What is done with fewer trials than the page says; appended flags win.
 SHORTER = [
     (r"--trials \d+", "--trials 3"),
+    (r"--tries \d+", "--tries 2"),
     (r"--episodes \d+", "--episodes 2"),
     (r"--seeds \d+-\d+", "--seeds 0-1"),
     (r"checkpoint-100", "checkpoint-2"),
     (r"\btrials=\d+", "trials=2"),
     (r"(python train\.py(?!.*--(?:trials|help|resume|again))[^#\n]*)", r"\1 --trials 2 "),
+    (r"(python train\.py(?!.*--(?:env|settings|help|resume|again))[^#\n]*)", rf"\1 {FEW_STEPS} "),
     (r"(sofnn_torch\.studies[^#\n]*)", r"\1 --seeds 0 --trials 1 "),
 ]
 
@@ -193,7 +198,8 @@ def script(page):
 def test_a_page_can_be_followed_from_its_top_to_its_end(page, place, tmp_path):
     folder = tmp_path / "checkout"
     shutil.copytree(place, folder, symlinks=True)
-    for name in ("first", "left", "sixty", "few"):  # the page itself makes them
+    made = ("first", "left", "sixty", "few", "sweep-q-sofnn-CartPole-v1")
+    for name in made:  # by the page itself
         shutil.rmtree(folder / "runs" / name)
     if page.name == "export.md":  # its last command reads a file of another tool
         (folder / "docs").unlink()

@@ -290,7 +290,7 @@ def _tell(sweep: Sweep, study: Any) -> None:
     print(f"best: train.py {preset_files.flags(preset_files.differences(config))}")
     print(f"written: {sweep.out / 'best.toml'}")
     print("next:")
-    print(f"  {terminal.program('cli')} --settings {quoted(sweep.out / 'best.toml')}")
+    print(f"  {terminal.program('train')} --settings {quoted(sweep.out / 'best.toml')}")
     print(f"  {terminal.program('plot')} {quoted(sweep.out)}")
     print(f"  optuna-dashboard {quoted(sweep.out / 'journal.log')}")
 

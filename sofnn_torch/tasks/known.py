@@ -64,6 +64,16 @@ TUNED: dict[str, dict[str, dict[str, Any]]] = {
         "net": {"width": (0.05,)},
         "q": {"trace_decay": 0.95, "action_gap": 0.7, "replay_every": 4},
     },
+    "MountainCarContinuous": {
+        "net": {"width": (0.059,)},
+        "q": {
+            "initial": 0.93,
+            "temperature": 0.0033,
+            "trace_decay": 0.95,
+            "action_gap": 0.7,
+            "replay_every": 2,
+        },
+    },
     "Acrobot": {
         "q": {"initial": -0.5, "temperature": 0.005, "trace_decay": 0.95, "action_gap": 0.7}
     },
