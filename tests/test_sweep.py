@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 from sofnn_torch import Config, evaluate, terminal
 from sofnn_torch.cli import parse
 from sofnn_torch.runs import checkpoint, preset_files
+from sofnn_torch.runs.directory import flatten
 from sofnn_torch.runs.session import RunOptions
 from sofnn_torch.sweep import __main__ as sweep
 from sofnn_torch.sweep import space, tries
@@ -154,6 +155,20 @@ def test_the_search_for_what_the_paper_does_not_print_leaves_what_it_prints(agen
     printed = {"sga.rate_mean", "sga.rate_deviation", "sga.gamma", "q.temperature", "q.gamma"}
     printed |= {"q.rate_state", "q.rate_action", "q.rate_constant", "maze.goal_reward", "trials"}
     assert len(found) >= 8 and not printed & found.keys()
+
+
+@pytest.mark.parametrize(
+    "file,env", [("continuous", "MountainCarContinuous-v0"), ("mountain_car", "MountainCar-v0")]
+)
+def test_the_spaces_of_the_tasks_hold_what_was_found_there(file, env):
+    path = Path(__file__).parents[1] / f"benchmarks/{file}.toml"
+    entries = {"agent": "q", "env": env}
+    found = space.ranges(preset_files.read(path), entries, path.name)
+    usual = flatten(dataclasses.asdict(Config(**entries)))
+    for name, range_ in found.items():
+        value = usual[name][0] if isinstance(usual[name], list) else usual[name]
+        inside = value in range_.choices if range_.choices else range_.low <= value <= range_.high
+        assert inside, name
 
 
 @given(st.floats(1e-6, 1e3), st.floats(1.01, 100), st.booleans(), st.integers(0, 9))

@@ -205,7 +205,10 @@ def test_what_is_not_supported_is_one_line(spaces, said, toy, tmp_path, capsys):
         ),
         ("--env MountainCar-v0 --preset paper", "--preset paper is for --env maze"),
         ("--env Reacher-v5 --agent q", "use SGA"),
-        ("--env MountainCar-v0 --axes a m 0 1", "--axes cannot be ['a', 'm', '0', '1']"),
+        (
+            "--env MountainCar-v0 --axes a m 0 1",
+            "--axes must be NAME UNIT LOW HIGH PERIOD ..., got 'a m 0 1'",
+        ),
         ("--env Pendulum-v1 --agent q --q.coding wheels", "for a robot with two wheels"),
     ],
 )
