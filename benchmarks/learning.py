@@ -2,9 +2,9 @@
 
 One decision's learning is everything that a learner does between two decisions: growth test,
 firing, temporal-difference error, update of the parameters, choice of the next action, gradient by
-autograd and eligibility traces. It is set against the least that any network of this kind needs
-in torch: one forward pass and one backward pass, written by hand for single tensors u, v (K, n)
-and c (K, m), without growth, traces, update, angles or actions.
+autograd and eligibility traces, without replay. It is set against the least that any network of
+this kind needs in torch: one forward pass and one backward pass, written by hand for single tensors
+u, v (K, n) and c (K, m), without growth, traces, update, angles or actions.
 
     python benchmarks/learning.py --out learning.json --plot docs/images/cost.png
 """
@@ -47,9 +47,9 @@ def fill(net: SOFNN, rules: int) -> None:
 
 
 def learner(name: str, rules: int, adapting: bool = False) -> Learner:
-    """Return a learner with the default settings and a number of rules that stays."""
+    """Return a learner with the default settings, without replay, and rules that stay."""
     config = Config(agent=name, network="sofnn")
-    part = getattr(config, name)
+    part = dataclasses.replace(getattr(config, name), replays=0, replay_every=0)
     if adapting:
         part = dataclasses.replace(part, rate_centre=1e-6, rate_width=1e-6)
     net = dataclasses.replace(config.net, max_rules=max(SIZES[-1], rules))
