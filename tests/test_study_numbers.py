@@ -11,7 +11,16 @@ import pytest
 
 from sofnn_torch.pictures import figures
 from sofnn_torch.runs.trial import Trajectory
-from sofnn_torch.studies import claims, collecting, drawing, report, results, robustness, running
+from sofnn_torch.studies import (
+    claims,
+    collecting,
+    drawing,
+    report,
+    results,
+    robustness,
+    running,
+    statistics,
+)
 from sofnn_torch.studies.__main__ import Name
 from sofnn_torch.studies.studies import STUDIES, settings
 
@@ -291,6 +300,12 @@ def test_arms_of_equal_settings_and_seeds_are_shown_once():
 
 
 # --------------------------------------------------------------------------------- statistics
+
+
+def test_the_middle_between_a_number_and_never_is_never():
+    values = np.array([0.0, 1.0, 2.0, results.NEVER, results.NEVER, results.NEVER])
+    said = results.cell(statistics.median(values))
+    assert said.startswith("never (") and "000" not in said
 
 
 def test_a_run_that_never_learns_counts_as_one_trial_more_than_it_had():

@@ -195,7 +195,7 @@ def page(rows: list[dict[str, Any]], commands: list[str]) -> str:
     """The page of what was measured."""
     head = ["learner", "seeds", "A [%]", "B at once [%]", "recovered after", "B learned [%]"]
     head += ["rules in A", "rules added in B", "A at the return [%]", "recovered again after"]
-    parts = ["# A world that changes", __doc__.split("\n\n")[2].replace("\n", " "), HOW]
+    parts = ["# A world that changes", __doc__.split("\n\n")[2].strip().replace("\n", " "), HOW]
     for change, text in CHANGES.items():
         table = list(_lines([row for row in rows if row["change"] == change]))
         if table:

@@ -16,7 +16,8 @@ from sofnn_torch.maze.layouts import STANDARD
 from sofnn_torch.numerals import decimal
 from sofnn_torch.studies.statistics import Measured, median, share
 
-NEVER = 1e15  # more than any run takes
+NEVER = 1e15  # what a run that never gets there takes
+MOST = 1e9  # more than any other takes, and less than a mean with it
 
 
 @dataclass(frozen=True)
@@ -148,7 +149,7 @@ def cell(measured: Measured, digits: int = 0, factor: float = 1, limit: float = 
     """
 
     def show(value: float) -> str:
-        if value >= NEVER:
+        if value > MOST:
             return "never"
         if factor * value > limit:
             return f"> {limit:,.{digits}f}"
