@@ -306,6 +306,8 @@ def test_the_middle_between_a_number_and_never_is_never():
     values = np.array([0.0, 1.0, 2.0, results.NEVER, results.NEVER, results.NEVER])
     said = results.cell(statistics.median(values))
     assert said.startswith("never (") and "000" not in said
+    values = np.array([200.0, *[results.NEVER] * 9])
+    assert results.cell(statistics.median(values)) == "never"
 
 
 def test_a_run_that_never_learns_counts_as_one_trial_more_than_it_had():

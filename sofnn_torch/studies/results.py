@@ -159,6 +159,7 @@ def cell(measured: Measured, digits: int = 0, factor: float = 1, limit: float = 
         return "-"
     if len(measured.values) > 1:
         return "; ".join(map(show, measured.values))
-    if math.isnan(measured.low) or measured.low == measured.high:
+    alike = measured.low == measured.high or measured.low > MOST
+    if math.isnan(measured.low) or alike:
         return show(measured.value)
     return f"{show(measured.value)} ({show(measured.low)} to {show(measured.high)})"
