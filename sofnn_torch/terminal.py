@@ -8,6 +8,7 @@ import shlex
 import signal
 import sys
 import threading
+import warnings
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -139,7 +140,7 @@ def attempt(
     Returns:
         The code of the work or of its failure; 128 and the number of the signal that stopped it.
     """
-    with output() as refused:
+    with output() as refused, _warnings_in_a_line():
         try:
             with _keyboard_interrupts():
                 code = work()
@@ -157,6 +158,20 @@ def attempt(
         say(f"error: the output cannot be written ({refused[0].strerror})")
         return 1
     return code
+
+
+@contextlib.contextmanager
+def _warnings_in_a_line() -> Iterator[None]:
+    """Inside, what libraries warn of is a line as our own; as it is where Python's -W is given."""
+
+    def show(message: Warning | str, *_: Any, **__: Any) -> None:
+        text = " ".join(re.sub(r"\x1b\[[0-9;]*m", "", str(message)).split())
+        say(f"warning: {text.removeprefix('WARN: ')}")
+
+    with warnings.catch_warnings():
+        if not sys.warnoptions:
+            warnings.showwarning = show
+        yield
 
 
 @contextlib.contextmanager

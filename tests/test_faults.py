@@ -19,7 +19,7 @@ import filelock
 import pytest
 from conftest import equal, quick_options, settings
 
-from sofnn_torch import training
+from sofnn_torch import cli, training
 from sofnn_torch.pictures import tensorboard
 from sofnn_torch.runs import checkpoint
 from sofnn_torch.runs.checkpoint import CheckpointError
@@ -28,6 +28,9 @@ from sofnn_torch.runs.factory import make_agent, make_env
 from sofnn_torch.runs.guard import Divergence
 from sofnn_torch.runs.places import default_name, numbered
 from sofnn_torch.runs.signals import NUMBERS, Interrupted, SignalTrap
+from sofnn_torch.studies import __main__ as studies
+from sofnn_torch.studies import change, peers
+from sofnn_torch.sweep import __main__ as sweep
 from sofnn_torch.training import play
 
 NAME = default_name(settings())
@@ -574,3 +577,31 @@ def test_no_gl_at_all_is_one_warning(tmp_path):
     assert done.returncode == 0, done.stderr
     assert sum("no video" in line for line in done.stderr.splitlines()) == 1, done.stderr
     assert checkpoint.find_latest(tmp_path / NAME)[1]["trial"] == 2
+
+
+@pytest.mark.parametrize(
+    ("main", "words"),
+    [
+        (cli.main, "--trials 1 --runs {}"),
+        (cli.main, "--trials 1 --seeds 0-1 --runs {}"),
+        (sweep.main, "--env CartPole-v1 --agent q --trials 1 --tries 1 --out {}"),
+        (studies.main, "--study growth --seeds 0 --trials 1 --out {}"),
+        (studies.main, "--study growth --seeds 0 --trials 1 --out free --runs {}"),
+        (change.main, "--seeds 0 --out {}"),
+        (peers.main, "--learners tiles --seeds 0 --out {}"),
+    ],
+)
+@pytest.mark.parametrize("below", ["", "/deeper"])
+def test_a_file_in_the_place_of_a_directory_is_said_before_anything_is_done(
+    main, words, below, tmp_path, monkeypatch, capsys
+):
+    if main is sweep.main:
+        pytest.importorskip("optuna")
+    monkeypatch.chdir(tmp_path)
+    Path("notes").write_text("mine")
+    monkeypatch.setattr(sys, "argv", ["command", *words.format(f"notes{below}").split()])
+    with pytest.raises(SystemExit) as stop:
+        sys.exit(main())
+    (line,) = capsys.readouterr().err.splitlines()
+    assert (stop.value.code, line.endswith("cannot be used (notes is a file)")) == (2, True), line
+    assert Path("notes").read_text() == "mine"

@@ -20,7 +20,7 @@ from sofnn_torch.rules.__main__ import main as rules_main
 from sofnn_torch.runs.session import build
 from sofnn_torch.runs.settings import Config, from_dict
 from sofnn_torch.tasks import survey
-from sofnn_torch.tasks.env import TaskEnv, look, make
+from sofnn_torch.tasks.env import TaskEnv, look, make, versioned
 
 CLASSIC = ["MountainCar-v0", "MountainCarContinuous-v0", "CartPole-v1", "Acrobot-v1", "Pendulum-v1"]
 UNIT = Box(-1, 1, (2,))
@@ -230,6 +230,21 @@ def test_an_id_may_name_the_module_that_registers_it(monkeypatch):
     gymnasium.register("Mine-v0", entry_point=lambda **_: Toy())
     assert [axis.name for axis in Config(env="my_tasks:Mine-v0").task.axes] == ["obs 1", "obs 2"]
     del gymnasium.registry["Mine-v0"]
+
+
+def test_an_id_without_a_version_is_that_of_the_newest():
+    assert Config(env="CartPole").env == Config(env="CartPole-v1").env == "CartPole-v1"
+    assert versioned("gymnasium:Pendulum") == "gymnasium:Pendulum-v1"
+    assert versioned("CartPole-v0") == "CartPole-v0"
+    assert versioned("Nothing") == "Nothing"
+    assert versioned("no_module:CartPole") == "no_module:CartPole"
+
+
+@pytest.mark.filterwarnings("default")
+def test_what_a_library_warns_of_is_a_line(tmp_path, capsys):
+    assert main(["--env", "CartPole-v0", "--trials", "1", "--runs", str(tmp_path)]) == 0
+    (line,) = [line for line in capsys.readouterr().err.splitlines() if "out of date" in line]
+    assert line.startswith("warning: The environment CartPole-v0 is out of date")
 
 
 # -------------------------------------------------------------------------------- random play

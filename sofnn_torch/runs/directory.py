@@ -23,7 +23,7 @@ import filelock
 from sofnn_torch.progress import say
 from sofnn_torch.runs import checkpoint, table
 from sofnn_torch.runs.checkpoint import CheckpointError
-from sofnn_torch.runs.places import UNNAMED, alone, first_free, meant
+from sofnn_torch.runs.places import UNNAMED, alone, first_free, meant, reason
 from sofnn_torch.runs.provenance import record
 from sofnn_torch.runs.settings import Config, from_dict
 from sofnn_torch.terminal import quoted
@@ -85,7 +85,7 @@ class Run:
                     shutil.rmtree(hidden, ignore_errors=True)
                     raise
         except OSError as error:
-            raise ValueError(f"{path} cannot be used ({error.strerror})") from None
+            raise ValueError(f"{path} cannot be used ({reason(path, error)})") from None
 
     @classmethod
     def open(cls, path: Path, config: Config, keep: int) -> "Run":
@@ -98,7 +98,7 @@ class Run:
         try:
             run._acquire()
         except OSError as error:
-            raise ValueError(f"{path} cannot be used ({error.strerror})") from None
+            raise ValueError(f"{path} cannot be used ({reason(path, error)})") from None
         return run
 
     def begin(self, state: dict[str, Any]) -> None:

@@ -39,6 +39,7 @@ def train(
         Interrupted: after every run was saved.
     """
     configs = [dataclasses.replace(config, seed=number) for number in parse(listed)]
+    places.directory(options.runs, "--runs")
     how = {key: value for key, value in vars(options).items() if key not in ("runs", "name")}
 
     def jobs() -> Iterator[Job]:

@@ -36,6 +36,25 @@ def numbered(path: Path) -> Iterator[Path]:
     yield from (path.with_name(f"{path.name}-{count}") for count in itertools.count(2))
 
 
+def directory(path: Path, flag: str) -> Path:
+    """The directory that a flag names, made if need be.
+
+    Raises:
+        ValueError: one line on why it cannot be used.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ValueError(f"{flag} {path} cannot be used ({reason(path, error)})") from None
+    return path
+
+
+def reason(path: Path, error: OSError) -> str:
+    """Why a directory cannot be used, in words."""
+    file = next((place for place in (path, *path.parents) if place.is_file()), None)
+    return f"{file} is a file" if file else str(error.strerror)
+
+
 def first_free(path: Path) -> Path:
     """The path, or with -2, -3 ... appended if it exists."""
     return next(p for p in numbered(path) if not p.exists())

@@ -27,7 +27,7 @@ from sofnn_torch.maze.spaces import ACTION_NAMES, wheel_speeds
 from sofnn_torch.network.axes import Axis, named
 from sofnn_torch.network.settings import NetworkConfig
 from sofnn_torch.runs import presets, rule_files
-from sofnn_torch.tasks.env import look
+from sofnn_torch.tasks.env import look, versioned
 from sofnn_torch.tasks.survey import survey
 
 PRESET: Any = None  # as a default: the value of the preset
@@ -94,6 +94,8 @@ class Config(Settings):
             object.__setattr__(self, "rules", str(self.rules))
         if isinstance(self.rules, str) and self.rules and "\n" not in self.rules:
             object.__setattr__(self, "rules", _text(Path(self.rules)))
+        if isinstance(self.env, str) and self.env != MAZE:
+            object.__setattr__(self, "env", versioned(self.env))
         for name, value in self._preset().items():
             given = getattr(self, name)
             if given is PRESET or (name == "axes" and len(given) == 0):

@@ -26,7 +26,7 @@ from sofnn_torch.bounds import Count, Settings
 from sofnn_torch.maze.layouts import STANDARD
 from sofnn_torch.maze.optimum import mean_optimum
 from sofnn_torch.maze.robot import checked, plan_of
-from sofnn_torch.runs import parallel
+from sofnn_torch.runs import parallel, places
 from sofnn_torch.studies import collecting, report, running
 
 Name = Literal["section5", "paper", "growth", "ablation", "sensors", "fixed", "robustness"]
@@ -128,6 +128,8 @@ def run(options: Options) -> int:
     jobs = running.plan(asked.runs, asked.study, asked.arms, numbers, changes, asked.any_code)
     if not jobs:
         raise ValueError(f"--arms {asked.arms}: no arm of {', '.join(asked.study)} has that")
+    places.directory(asked.out, "--out")
+    places.directory(asked.runs, "--runs")
     failed = running.execute(jobs, asked.workers, asked.cluster)
     optimum = mean_optimum(plan_of(str(changes.get("maze.layout", STANDARD))))
     for name in asked.study:

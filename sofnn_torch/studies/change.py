@@ -29,7 +29,7 @@ if __name__ == "__main__":  # Ctrl-C while libraries load
 from sofnn_torch import terminal
 from sofnn_torch.bounds import Count, Settings
 from sofnn_torch.maze.layouts import STANDARD, standard_path
-from sofnn_torch.runs import parallel, seeding
+from sofnn_torch.runs import parallel, places, seeding
 from sofnn_torch.runs.factory import make_agent, make_env
 from sofnn_torch.runs.session import arithmetic
 from sofnn_torch.runs.settings import Config
@@ -235,7 +235,7 @@ def run(options: Options) -> int:
     rows = read_table(table) if table.exists() else []
     commands = json.loads(notes.read_text()) if notes.exists() else []
     if not options.report_only:
-        options.out.mkdir(parents=True, exist_ok=True)
+        places.directory(options.out, "--out")
         _complete(options, rows, table)
         rows = read_table(table)
         commands = list(dict.fromkeys([*commands, command(options)]))

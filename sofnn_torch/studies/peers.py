@@ -31,7 +31,7 @@ from sofnn_torch.bounds import Count, Settings
 from sofnn_torch.maze.layouts import STANDARD
 from sofnn_torch.maze.optimum import mean_optimum
 from sofnn_torch.maze.robot import plan_of
-from sofnn_torch.runs import parallel, seeding
+from sofnn_torch.runs import parallel, places, seeding
 from sofnn_torch.runs.factory import make_agent, make_env
 from sofnn_torch.runs.session import arithmetic
 from sofnn_torch.runs.settings import Config
@@ -325,7 +325,7 @@ def run(options: Options) -> int:
     table, notes = options.out / "peers.csv", options.out / "peers.json"
     if not options.report_only:
         seeds = parallel.parse(options.seeds)
-        options.out.mkdir(parents=True, exist_ok=True)
+        places.directory(options.out, "--out")
         for learner in options.learners:
             told: dict[str, Any] = {"command": command(learner, options), "settings": {}}
             if learner not in OURS:

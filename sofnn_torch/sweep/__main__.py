@@ -30,7 +30,7 @@ from sofnn_torch.bounds import Count, Settings, Within
 from sofnn_torch.progress import Progress, say
 from sofnn_torch.runs import parallel, preset_files
 from sofnn_torch.runs.guard import Divergence
-from sofnn_torch.runs.places import default_name
+from sofnn_torch.runs.places import default_name, directory
 from sofnn_torch.runs.settings import MAZE, Config
 from sofnn_torch.sweep import space, tries
 from sofnn_torch.sweep.space import Range
@@ -149,7 +149,7 @@ def _open(sweep: Sweep) -> Any:
     asked |= {"entries": sweep.entries, "space": {n: vars(r) for n, r in sweep.ranges.items()}}
     asked = json.loads(json.dumps(asked))
     try:
-        sweep.out.mkdir(parents=True, exist_ok=True)
+        directory(sweep.out, "--out")
         if any(sweep.out.iterdir()) and not (sweep.out / "journal.log").exists():
             raise ValueError(f"--out {sweep.out} holds something that is no sweep")
         backend = JournalFileBackend(str(sweep.out / "journal.log"))

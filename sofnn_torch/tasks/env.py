@@ -2,12 +2,14 @@
 
 import difflib
 import functools
+import importlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium.envs import registration
 from gymnasium.spaces import Box, Discrete, Space
 from numpy.typing import NDArray
 
@@ -192,6 +194,23 @@ def make(
             reason = "it is not registered" + (f"; did you mean {near[0]}?" if near else "")
         raise ValueError(f"{env_id!r} cannot be made: {reason}") from None
     return TaskEnv(env, axes)
+
+
+@functools.cache
+def versioned(env_id: str) -> str:
+    """The id with its newest version where it names none, so that a run keeps its task.
+
+    Ids that are not registered, or whose module cannot be imported, stay: `make` says why.
+    """
+    module, _, name = env_id.rpartition(":")
+    try:
+        if module:
+            importlib.import_module(module)
+        namespace, plain, version = registration.parse_env_id(name)
+        newest = registration.find_highest_version(namespace, plain)
+    except Exception:  # of the registry, or of the module
+        return env_id
+    return env_id if version is not None or newest is None else f"{env_id}-v{newest}"
 
 
 @functools.cache
