@@ -13,6 +13,7 @@ import dataclasses
 import json
 import shutil
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -34,6 +35,7 @@ STEPS = {
     "Pendulum-v1": 20_000,
 }
 EPISODES = 20  # trials that the learned policy plays
+KEPT = "played.json"
 REPLAY = {"with": True, "without": False}
 
 
@@ -68,33 +70,36 @@ def settings(env: str, agent: str, seed: int, replay: bool) -> Config:
     return dataclasses.replace(config, **{agent: learner})
 
 
-def learned(config: Config, steps: int, run: Path) -> dict[str, float]:
+def learned(config: Config, steps: int, run: Path) -> dict[str, Any]:
     """Train a run to so many environment steps and play it: steps, rules, seconds, mean return."""
-    known = run / "played.json"
-    found: dict[str, float]
-    if known.exists():
-        found = json.loads(known.read_text())
-        return found
+    found, records = trained(config, run, lambda record: record.total_steps >= steps)
+    if records:
+        found["return"] = float(np.mean([record.reward for record in records]))
+        keep(found, run)
+    return found
+
+
+def trained(
+    config: Config, run: Path, over: Callable[[TrialRecord], bool] | None = None
+) -> tuple[dict[str, Any], list[TrialRecord]]:
+    """Train a run until it is over and play it; of one that did, what was kept, without trials."""
+    if (run / KEPT).exists():
+        return json.loads((run / KEPT).read_text()), []
     shutil.rmtree(run, ignore_errors=True)  # it was cut short
-
-    def over(record: TrialRecord) -> bool:
-        return record.total_steps >= steps
-
     begin = time.process_time()
     train(config, RunOptions.silent(run), over)
     seconds = time.process_time() - begin
     config, agent, _, state = load(run)
     with arithmetic():
         records = evaluate(config, agent, EPISODES)
-    found = {
-        "seed": config.seed,
-        "steps": state["total_steps"],
-        "rules": agent.net.n_rules,
-        "seconds": round(seconds, 1),
-        "return": float(np.mean([record.reward for record in records])),
-    }
-    known.write_text(json.dumps(found) + "\n")
-    return found
+    rules = agent.net.n_rules
+    found = {"seed": config.seed, "steps": state["total_steps"], "rules": rules}
+    return found | {"seconds": round(seconds, 1)}, records
+
+
+def keep(found: dict[str, Any], run: Path) -> None:
+    """Keep what was found with the run."""
+    (run / KEPT).write_text(json.dumps(found) + "\n")
 
 
 def row(cell: dict[str, Any]) -> str:

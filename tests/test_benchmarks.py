@@ -14,6 +14,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 import compiled
 import growth
 import learning
+import mazes
 import neighbours
 import reduce
 import tasks
@@ -124,16 +125,17 @@ def test_small_rule_bases_are_compared_with_the_full_one_of_their_seed():
 
 def test_tasks_are_measured_to_their_steps_with_replay_and_without(tmp_path, monkeypatch, capsys):
     out, runs = tmp_path / "tasks.json", tmp_path / "runs"
-    flags = ["--env", "CartPole-v1", "--seeds", "2", "--steps", "60", "--runs", str(runs)]
+    flags = ["--env", "Pendulum-v1", "--seeds", "2", "--steps", "300", "--runs", str(runs)]
     monkeypatch.setattr(sys, "argv", ["tasks.py", *flags, "--out", str(out)])
     monkeypatch.setattr(tasks, "EPISODES", 2)
     tasks.main()
     cells = json.loads(out.read_text())
     assert [cell["replay"] for cell in cells] == ["with", "without"]
-    assert all(60 <= seed["steps"] < 560 for cell in cells for seed in cell["seeds"])
+    assert all(seed["steps"] == 400 for cell in cells for seed in cell["seeds"])
     # Before the second trial there is nothing to replay: both arms begin alike.
-    first = [run.read_text().splitlines()[:2] for run in sorted(runs.glob("*/trials.csv"))]
-    assert first[0] == first[2] != first[1] == first[3]
+    trials = [run.read_text().splitlines() for run in sorted(runs.glob("*/trials.csv"))]
+    first, second = [lines[1] for lines in trials], [lines[2] for lines in trials]
+    assert first[0] == first[2] != first[1] == first[3] and len(set(second)) == 4
     printed = capsys.readouterr().out
     monkeypatch.setattr(tasks, "train", None)  # what is there is not trained again
     tasks.main()
@@ -142,6 +144,40 @@ def test_tasks_are_measured_to_their_steps_with_replay_and_without(tmp_path, mon
     table = capsys.readouterr().out.splitlines()[-4:]
     assert table == printed.splitlines()[-4:]
     assert len(table[0].split("|")) == len(table[2].split("|"))
+
+
+def test_mazes_are_measured_once_and_rows_of_others_stay(tmp_path, monkeypatch, capsys):
+    out, runs = tmp_path / "mazes.json", tmp_path / "runs"
+    flags = ["--seeds", "2", "--trials", "2", "--max-steps", "100", "--runs", str(runs)]
+    for layout, agents in (("starts", ("sga",)), ("open", ("sga", "q")), ("open", ("sga", "q"))):
+        told = ["--layout", layout, "--agent", *agents, "--out", str(out)]
+        monkeypatch.setattr(sys, "argv", ["mazes.py", *flags, *told])
+        mazes.main()
+        if layout == "open":
+            monkeypatch.setattr(tasks, "train", None)  # what is there is not trained again
+    rows = json.loads(out.read_text())
+    assert [(row["layout"], row["agent"]) for row in rows] == [
+        ("open", "sga"),
+        ("open", "q"),
+        ("starts", "sga"),
+    ]
+    assert [seed["seed"] for seed in rows[0]["seeds"]] == [0, 1]
+    capsys.readouterr()
+    monkeypatch.setattr(sys, "argv", ["mazes.py", "--table", str(out)])
+    mazes.main()
+    head, _, first, *_ = capsys.readouterr().out.splitlines()
+    assert len(head.split("|")) == len(first.split("|")) and first.startswith(
+        "| `open` | 202 | SGA"
+    )
+
+
+def test_misses_of_a_maze_count_in_its_share_and_not_in_its_steps():
+    played = [[200] * 20, [0] * 10 + [300] * 10]
+    seeds = [{"seed": s, "rules": 5 + s, "seconds": 1.0, "played": p} for s, p in enumerate(played)]
+    about = {"layout": "open", "agent": "q", "trials": 3, "optimum": 202.0}
+    assert mazes.row(about | {"seeds": seeds}) == (
+        "`open`,202,Q,3,2,100; 50,50,200; 300,5-6,1".split(",")
+    )
 
 
 def test_a_row_has_an_interval_from_five_seeds_on():

@@ -158,7 +158,13 @@ def test_the_search_for_what_the_paper_does_not_print_leaves_what_it_prints(agen
 
 
 @pytest.mark.parametrize(
-    "file,env", [("continuous", "MountainCarContinuous-v0"), ("mountain_car", "MountainCar-v0")]
+    "file,env",
+    [
+        ("continuous", "MountainCarContinuous-v0"),
+        ("mountain_car", "MountainCar-v0"),
+        ("cart_pole", "CartPole-v1"),
+        ("acrobot", "Acrobot-v1"),
+    ],
 )
 def test_the_spaces_of_the_tasks_hold_what_was_found_there(file, env):
     path = Path(__file__).parents[1] / f"benchmarks/{file}.toml"
@@ -166,7 +172,8 @@ def test_the_spaces_of_the_tasks_hold_what_was_found_there(file, env):
     found = space.ranges(preset_files.read(path), entries, path.name)
     usual = flatten(dataclasses.asdict(Config(**entries)))
     for name, range_ in found.items():
-        value = usual[name][0] if isinstance(usual[name], list) else usual[name]
+        value = list(usual[name]) if isinstance(usual[name], list | tuple) else usual[name]
+        value = value[0] if isinstance(value, list) and not range_.choices else value
         inside = value in range_.choices if range_.choices else range_.low <= value <= range_.high
         assert inside, name
 

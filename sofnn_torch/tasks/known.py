@@ -80,8 +80,25 @@ TUNED: dict[str, dict[str, dict[str, Any]]] = {
             "replay_every": 2,
         },
     },
+    "CartPole": {
+        "net": {"width": (0.116,), "theta": 0.395},
+        "q": {
+            "rate_action": 0.4,
+            "temperature": 0.0068,
+            "trace_decay": 0.95,
+            "replay_every": 2,
+        },
+    },
     "Acrobot": {
-        "q": {"initial": -0.5, "temperature": 0.005, "trace_decay": 0.95, "action_gap": 0.7}
+        "net": {"width": (0.28, 0.28, 0.28, 0.28, 0.08, 0.06), "theta": 0.4},
+        "q": {
+            "initial": -0.2,
+            "temperature": 0.0012,
+            "rate_action": 0.3,
+            "rate_constant": 0.3,
+            "action_gap": 0.7,
+            "replay_every": 2,
+        },
     },
     "Pendulum": {
         "net": {"width": (0.1,), "theta": 0.5},
